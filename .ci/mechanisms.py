@@ -127,6 +127,8 @@ MECHANISMS = (
     Mechanism('enlarged images found',
               'sensing/enlargement.py',
               {'segmenter.enlargement': _returning(None)}),
+    Mechanism('disparities and pictures found', 'sensing/encoding.py',
+              {'segmenter.encoding': _returning(None)}),
     # Regions.
     Mechanism('patches as wide as the distortion',
               'by_planes/patches.py',

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter, SequenceSegmenter, segment
-from rangeseg_ros.core.sensing.disparity import from_disparity, shows_disparity
+from rangeseg_ros.core.sensing.encoding import decoded, encoding
 from rangeseg_ros.core.sensing.enlargement import enlargement, interpolation, replication
 from rangeseg_ros.core.sensing.verdict import (
     _share_of_range,
@@ -252,22 +252,32 @@ def room():
     return simulate(kinect_room(731), Kinect(731), seed=731)
 
 
-def disparities(frame, levels=None):
-    """As floats, or rounded to so many levels, in whatever unit."""
-    depth = frame.depth.astype(np.float64)
-    values = np.where(depth > 0, 3000 / np.maximum(depth, 1), 0)
+def pictured(frame, kind, levels=None):
+    """A frame as disparities or a picture of its depth, rounded to so many levels or not."""
+    known, depth = frame.depth > 0, frame.depth.astype(float)
+    if kind == 'disparity':
+        depth[known] = 1 / depth[known]
+    else:
+        ends = np.quantile(depth[known], [0, 1] if kind == 'near is dark' else [1, 0])
+        depth[known] = (depth[known] - ends[0]) / (ends[1] - ends[0])
+    values = depth / depth[known].max()
     if levels:
-        values = np.round(values * levels / values.max()) * 10 / levels
-    return RangeImage.from_depth(values.astype(np.float32), frame.camera)
+        values = np.maximum(np.round(values * levels), 1) / levels
+    return RangeImage.from_depth(np.where(known, 10 * values, 0).astype(np.float32), frame.camera)
 
 
-@pytest.mark.parametrize('levels', [None, 255])
-def test_disparities_are_found_and_segmented_as_such(room, levels):
-    image = disparities(room, levels)
-    assert shows_disparity(image)
+@pytest.mark.parametrize(
+    'kind, levels',
+    [('disparity', None), ('disparity', 255), ('near is bright', 255), ('near is dark', 255)],
+)
+def test_disparities_and_pictures_are_segmented_as_such(room, kind, levels):
+    image = pictured(room, kind, levels)
+    signs = {'disparity': 0, 'near is bright': 1, 'near is dark': -1}
+    assert np.sign(encoding(image)) == signs[kind]
     result = Segmenter().segment(image)
     assert result.image is image and result.verdict.invalid
-    assert result.verdict.reasons[0] == 'disparity instead of depth'
+    assert result.values == ('picture' if 'near' in kind else 'disparity')
+    assert result.verdict.reasons[0] == f'{result.values} instead of depth'
     assert result.ground is None and not result.terrain.any()
     depth = Segmenter().segment(RangeImage.from_depth(room.depth, room.camera))
     assert depth.verdict.ok
@@ -277,19 +287,37 @@ def test_disparities_are_found_and_segmented_as_such(room, levels):
         assert (own & same).sum() > 0.9 * (own | same).sum()
 
 
-def test_disparities_of_disparities_are_depths(room):
+def test_only_pictures_begin_at_an_unknown_distance(room):
+    """One surface that bends may look like that, and an image of more than 8 bits is measured."""
+    image = pictured(room, 'near is dark')
+    assert encoding(image) < 0
+    fine = np.random.default_rng(1).uniform(0.9999, 1.0001, image.shape).astype(np.float32)
+    assert encoding(replace(image, inverse=image.inverse * fine)) in (0.0, None)
+
+
+@pytest.mark.parametrize('kind', ['disparity', 'near is bright', 'near is dark'])
+def test_decoded_images_are_depths(room, kind):
     """But for a factor."""
-    image = RangeImage.from_depth(room.depth, room.camera)
-    again = from_disparity(disparities(room)).inverse
-    np.testing.assert_array_equal(again > 0, image.valid)
-    ratio = again[image.valid] / image.inverse[image.valid]
-    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-4)
+    depth = RangeImage.from_depth(room.depth, room.camera)
+    known = room.depth[room.depth > 0]
+    q = {
+        'disparity': 0.0,
+        'near is bright': 1 - known.min() / known.max(),
+        'near is dark': 1 - known.max() / known.min(),
+    }[kind]
+    again = decoded(pictured(room, kind), q).inverse
+    # The end that is black is no measurement.
+    seen = again > 0
+    assert (seen == depth.valid).mean() > 0.999
+    ratio = again[seen] / depth.inverse[seen]
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-3)
+    assert np.median(again[seen]) == pytest.approx(0.5)
 
 
 def test_nothing_is_told_from_little():
     camera = kinect_camera()
     for depth in (np.zeros(camera.shape, np.uint16), np.full(camera.shape, 2000, np.uint16)):
-        assert not shows_disparity(RangeImage.from_depth(depth, camera))
+        assert encoding(RangeImage.from_depth(depth, camera)) is None
 
 
 @pytest.mark.parametrize('size', [(160, 120), (320, 240), (640, 480)])
@@ -297,13 +325,14 @@ def test_a_crease_is_no_bend(size):
     """Along a floor that meets a wall every block beside the other shows the same."""
     camera = kinect_camera(*size)
     depth = np.minimum(0.8 / np.maximum(camera.rays[..., 1], 1e-6), 3)
-    assert not shows_disparity(RangeImage.from_depth(depth, camera))
+    assert encoding(RangeImage.from_depth(depth, camera)) is None
     # A small image tells too little.
-    assert shows_disparity(RangeImage.from_depth(1 / depth, camera)) == (size[0] > 160)
+    found = encoding(RangeImage.from_depth(1 / depth, camera))
+    assert found == (0.0 if size[0] > 160 else None)
 
 
 @pytest.mark.parametrize('focal', [1e4, 1e7, 1e12])
 def test_narrow_views_tell_nothing_and_pass(focal):
     camera = Camera(640, 480, focal, focal, 319.5, 239.5)
     depth = np.random.default_rng(1).uniform(1, 2, camera.shape)
-    assert not shows_disparity(RangeImage.from_depth(depth, camera))
+    assert encoding(RangeImage.from_depth(depth, camera)) is None

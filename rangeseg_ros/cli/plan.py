@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import click
 
 from rangeseg_ros.batch.plan import PlanOutcome, PlanTask
 from rangeseg_ros.cli import options, recordings
-from rangeseg_ros.core.config import Config
 from rangeseg_ros.tasks import Failure
 
 
@@ -40,14 +40,9 @@ def command(
     ctx: click.Context,
     paths: tuple[Path, ...],
     output: Path,
-    headroom: float,
-    resolution: float,
-    depth_topic: str | None,
-    camera_topic: str | None,
-    overwrite: bool,
     jobs: int | None,
     scheduler: str | None,
-    config: Config,
+    **settings: Any,
 ) -> None:
     """Make floor plans and maps of recordings. Needs the extra plan.
 
@@ -62,14 +57,13 @@ def command(
 
     All are in metres in the fixed frame, turned so that z is up where it is not; without
     --fixed-frame in that which the tf of the recording moves in, without tf in the odometry of the
-    planes. Walls are made
-    exactly square where their covariances allow it.
+    planes. Walls are made exactly square where their covariances allow it.
     """
     missing = [name for name in ('ezdxf', 'trimesh') if find_spec(name) is None]
     if missing:
         raise click.ClickException(f'{" and ".join(missing)} missing: install the extra plan')
     tasks = [
-        PlanTask(path, folder, config, headroom, resolution, overwrite, depth_topic, camera_topic)
+        PlanTask(path, folder, **settings)
         for path, folder in recordings.with_folders(paths, output, scheduler)
     ]
     for task in tasks:

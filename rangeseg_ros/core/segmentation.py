@@ -92,8 +92,8 @@ class Segmentation:
         See `curved`, of `cells`; None where none were looked for.
     identified : bool
         False where `sensor` was to be measured and the image says too little: it is as stated.
-    disparity : bool
-        Whether the image is one of disparities; what is measured of planes is then in no unit.
+    values : str
+        Those of the image: depth, or disparity or picture, whose planes are measured in no unit.
     """
 
     labels: NDArray[np.uint16]
@@ -110,7 +110,7 @@ class Segmentation:
     cells: Cells | None = field(default=None, repr=False)
     curved_regions: NDArray[np.uint16] | None = field(default=None, repr=False)
     identified: bool = True
-    disparity: bool = False
+    values: str = 'depth'
 
     def __repr__(self) -> str:
         height, width = self.labels.shape
@@ -161,7 +161,7 @@ class Segmentation:
             plane.label: -plane.normal / (plane.distance + plane.normal @ place)
             for plane in self.planes
         }
-        doubts = self.identified, self.disparity
+        doubts = self.identified, self.values
         return judge(self.image, self.labels, thetas, self.curved, *doubts)
 
     def of_pixels(

@@ -26,7 +26,7 @@ from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.binning import Bins, bin_side
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.bridges import bridge_holes
-from rangeseg_ros.core.sensing.disparity import from_disparity, shows_disparity
+from rangeseg_ros.core.sensing.encoding import decoded, encoding
 from rangeseg_ros.core.sensing.enlargement import Cells, enlargement
 from rangeseg_ros.core.sensing.grid import GridEdges, View, grid_of
 from rangeseg_ros.core.sensing.jump_edges import jump_edges
@@ -91,11 +91,13 @@ class Segmenter:
             )
         if config.mask and image.body is None:
             raise RangeImageError('mask is not applied yet: segment corrected(image, config)')
-        if shows_disparity(image):
-            depth = from_disparity(image)
+        if (q := encoding(image)) is not None:
+            depth = decoded(image, q)
             result = self._undone(depth, enlargement(depth))
             # Heights in no unit are no ground to drive on.
-            return replace(result, image=image, disparity=True, survey=None)
+            return replace(
+                result, image=image, values='picture' if q else 'disparity', survey=None
+            )
         return self._undone(image, enlargement(image))
 
     def _undone(self, image: RangeImage, cells: Cells | None) -> Segmentation:

@@ -84,6 +84,7 @@ class SequenceSegmenter:
         pose: Transform | None = None,
         height: float | None = None,
         up_sd: float | None = None,
+        result: Segmentation | None = None,
     ) -> Segmentation:
         """Label the next frame; ids and roles of its planes are set.
 
@@ -102,24 +103,10 @@ class SequenceSegmenter:
             `sensor_height` is 0.
         up_sd : float, optional
             Standard deviation of `up`, degrees, where it is not the parameter `up_sd`.
+        result : Segmentation, optional
+            Of a `Segmenter` for `image`, as where it works on several frames at once.
         """
-        placed = stamp, up, pose, height, up_sd
-        return self.follow(self._segmenter.segment(image), image, *placed)
-
-    def follow(
-        self,
-        result: Segmentation,
-        image: RangeImage,
-        stamp: int,
-        up: ArrayLike | None = None,
-        pose: Transform | None = None,
-        height: float | None = None,
-        up_sd: float | None = None,
-    ) -> Segmentation:
-        """Find the planes of the frames before in the `result` of a `Segmenter` for the next one.
-
-        As `segment` does, for segmenters that work on several frames at once.
-        """
+        result = result or self._segmenter.segment(image)
         config = self.config
         if up_sd not in (None, config.up_sd):
             config = replace(config, up_sd=up_sd)

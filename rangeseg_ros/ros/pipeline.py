@@ -169,7 +169,7 @@ class Pipeline:
         sequence = self._sequence
         at = self._up.settle(segmented.at, stamp, config)
         placed = stamp, at.up, at.pose, at.height, at.up_sd
-        found = sequence.follow(segmented.found, segmented.image, *placed)
+        found = sequence.segment(segmented.image, *placed, segmented.found)
         lost = at.lost
         if not lost and found.tilt:
             lost = f'no terrain: {found.tilt}'

@@ -1,4 +1,9 @@
-"""Images of disparity, or of inverse depth, that are taken for depth: found and undone."""
+"""Images whose values are no distances but disparities, or a picture of depth: found and undone.
+
+Distances z are proportional to 1 - q v of the values v, the largest of which is 1: q > 0 where
+what is near is bright in a picture, q < 0 where it is dark and black is at some distance. A plane
+is linear in 1 / (1 - q v) then, and in v where q = 0: that is a disparity.
+"""
 
 from __future__ import annotations
 
@@ -12,31 +17,34 @@ from rangeseg_ros.core.config import VGA
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.verdict import ODDS, SPREAD
-from rangeseg_ros.core.significance import CLEARLY, quantile
+from rangeseg_ros.core.significance import CLEARLY, chi2_quantile, quantile
 
 # Pixels of VGA along the side of a block, wide enough to show the bend, and those that tell it.
 _SIDE, _SAMPLES = 48, 8
+# Values of q, by quarters of octaves of 1 / (1 - q): farthest over nearest, or its inverse.
+_Q = 1 - 2.0 ** np.arange(3, -4.1, -0.25)
+# Metres, about what indoor cameras see; for 1.5 to 4 of them planes of pictures are found alike.
+_USUAL = 2.0
 
 
-def shows_disparity(image: RangeImage) -> bool:
-    """Whether surfaces are flat only if the values are disparities.
+def encoding(image: RangeImage) -> float | None:
+    """The q of an image, 0 for disparities; None where its values are distances.
 
-    Of a plane theta . ray = 1/z the disparity taken for a depth gives 1 / (phi . ray). Each block
-    tells its share of that bend, 0 for depth and 1 for disparity; the likelihoods of the two are
-    compared, with the tails of Cauchy's distribution, as most blocks are not flat.
+    Of a plane theta . ray = 1/z, disparities taken for depths give 1 / (phi . ray), and other
+    values a share 1 / (1 - q v) of that bend, distances none. Each block tells its share; the
+    likelihoods are compared, with the tails of Cauchy's distribution, as most blocks are not flat.
     """
     if image.camera is None:
-        return False
+        return None
     inverse = _blocks(image.inverse[..., None])
     known = (inverse > 0).all(axis=(1, 2))
     if not known.any():
-        return False
-    fits = _fits.get(image.camera)
-    if fits is None:
+        return None
+    if image.camera not in _fits:
         # Rays of a very narrow view are all but one, but for the rounding of their squares.
         rays, precise = _blocks(image.rays), np.finfo(np.float64).eps ** 0.5
-        fits = _fits[image.camera] = rays, np.linalg.pinv(rays, rcond=precise)
-    inverse, rays, fit = inverse[known], fits[0][known], fits[1][known]
+        _fits[image.camera] = rays, np.linalg.pinv(rays, rcond=precise)
+    inverse, rays, fit = (each[known] for each in (inverse, *_fits[image.camera]))
     # Behind the camera where no plane fits.
     level = np.maximum(rays @ (fit @ (1 / inverse)), 0.5 / inverse.max(axis=1, keepdims=True))
     both = np.concatenate([inverse, 1 / level], axis=2)
@@ -49,19 +57,27 @@ def shows_disparity(image: RangeImage) -> bool:
     # What is rougher than most, as where surfaces meet, is no part of a plane.
     rough = noise / inverse.max(axis=(1, 2)) ** 2
     flat = rough <= CLEARLY * quantile(rough, 0.5)
+    values = inverse.min() * (1 / inverse[flat]).mean(axis=(1, 2))
     # Real planes differ by more than their noise tells.
-    variance = noise / square + SPREAD**2
-    odds = np.log1p(share**2 / variance) - np.log1p((share - 1) ** 2 / variance)
+    share, variance = share[flat], (noise / square)[flat] + SPREAD**2
+    off = np.log1p((share - 1 / (1 - _Q[:, None] * values)) ** 2 / variance)
     # Of a curved surface, neighbours tell the same: two blocks count as one.
-    return bool(odds[flat].sum() / 2 > ODDS)
+    odds = (np.log1p(share**2 / variance) - off).sum(axis=1) / 2
+    # A disparity has no q to fit: what that explains must be more than chance.
+    odds[_Q == 0] += chi2_quantile(1) / 2
+    # Only a picture, of 8 bits, has one.
+    if odds.max() > ODDS and len(np.unique(image.inverse[image.valid])) > 2**8:
+        odds[_Q != 0] = 0
+    return float(_Q[odds.argmax()]) if odds.max() > ODDS else None
 
 
-def from_disparity(image: RangeImage) -> RangeImage:
-    """The image whose disparities the values are, at about the same distance."""
-    known = image.inverse[image.valid]
-    with np.errstate(divide='ignore'):
-        values = np.where(image.valid, 1 / image.inverse, 0)
-    return replace(image, inverse=(np.median(known) ** 2 * values).astype(np.float32))
+def decoded(image: RangeImage, q: float) -> RangeImage:
+    """The image of distances that the values stand for, but for a factor."""
+    values = np.divide(1, image.inverse, out=np.zeros(image.shape), where=image.valid)
+    values /= max(values.max(initial=0), 1e-300)
+    inverse = 1 / (1 - q * values) * image.valid if q else values
+    inverse /= _USUAL * np.median(inverse[image.valid])
+    return replace(image, inverse=inverse.astype(np.float32))
 
 
 # Rays of blocks (N, S, 3), and what makes of inverse depths along them the planes (N, 3, S) of

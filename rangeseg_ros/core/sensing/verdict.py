@@ -28,6 +28,7 @@ _WRONG_UNITS = (5.0, 0.2, 10.0, 0.1, 1000.0, 0.001)
 # Reasons for which every metric result is wrong, not only less certain.
 _INVALID = {
     'disparity instead of depth',
+    'picture instead of depth',
     'range instead of z',
     'scale improbable',
     'millimetres in floats',
@@ -60,7 +61,7 @@ def judge(
     planes: Mapping[int, NDArray[np.float64]],
     curved: NDArray[np.uint16] | None = None,
     identified: bool = True,
-    disparity: bool = False,
+    values: str = 'depth',
 ) -> Verdict:
     """Look for what makes an image doubtful in which planes, label -> theta (3,), were found.
 
@@ -77,10 +78,10 @@ def judge(
         found[f'filled {100 * share:.0f} %'] = (
             'Pixels beside edges copy their neighbours: holes were filled; switch that off.'
         )
-    if disparity:
-        found['disparity instead of depth'] = (
-            'Surfaces are flat only if the values are disparities: they are segmented as such, in '
-            'no unit; depth is focal length times baseline over disparity.'
+    if values != 'depth':
+        found[f'{values} instead of depth'] = (
+            f'Surfaces are flat only if the values are those of a {values}: they are segmented as '
+            'such, in no unit.'
         )
     elif shows_range(image, labels, planes):
         found['range instead of z'] = (
