@@ -23,6 +23,8 @@ from rangeseg_ros.core.significance import CLEARLY, chi2_quantile, quantile
 _SIDE, _SAMPLES = 48, 8
 # Values of q, by quarters of octaves of 1 / (1 - q): farthest over nearest, or its inverse.
 _Q = 1 - 2.0 ** np.arange(3, -4.1, -0.25)
+# A disparity has no q to fit: what that explains must be more than chance.
+_CHANCE = chi2_quantile(1) / 2
 # Metres, about what indoor cameras see; for 1.5 to 4 of them planes of pictures are found alike.
 _USUAL = 2.0
 
@@ -63,9 +65,8 @@ def encoding(image: RangeImage) -> float | None:
     off = np.log1p((share - 1 / (1 - _Q[:, None] * values)) ** 2 / variance)
     # Of a curved surface, neighbours tell the same: two blocks count as one.
     odds = (np.log1p(share**2 / variance) - off).sum(axis=1) / 2
-    # A disparity has no q to fit: what that explains must be more than chance.
-    odds[_Q == 0] += chi2_quantile(1) / 2
-    # Only a picture, of 8 bits, has one.
+    odds[_Q == 0] += _CHANCE
+    # Only a picture, of 8 bits, has another q.
     if odds.max() > ODDS and len(np.unique(image.inverse[image.valid])) > 2**8:
         odds[_Q != 0] = 0
     return float(_Q[odds.argmax()]) if odds.max() > ODDS else None

@@ -80,8 +80,7 @@ def judge(
         )
     if values != 'depth':
         found[f'{values} instead of depth'] = (
-            f'Surfaces are flat only if the values are those of a {values}: they are segmented as '
-            'such, in no unit.'
+            f'Surfaces are flat only if this is a {values}: it is segmented as such, in no unit.'
         )
     elif shows_range(image, labels, planes):
         found['range instead of z'] = (
