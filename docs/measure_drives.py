@@ -1,6 +1,7 @@
 """Measure how early a robot that drives up to hazards has them in its grid, and whether they stay.
 
 python docs/measure_drives.py SENSOR SEED...     as of `rangeseg simulate terrain`
+python docs/measure_drives.py SENSOR SEED hour   one hazard again and again, and the memory taken
 
 The robot drives at half a metre a second from 3.6 m up to 0.4 m before a hazard, which is out of
 view by then, waits for two seconds and backs off to 2 m; five frames a second. The stated up is
@@ -11,12 +12,14 @@ those of the odometry from planes and edges.
 import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import Config, RangeImage
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE
+from rangeseg_ros.core.ground.grid import GroundGrid
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.scenes import Pose
@@ -113,20 +116,57 @@ def drive(
         spent.append(1e3 * (time.process_time() - begun))
         if home is None:
             home = true.after(sequence.pose.inverse()) if odometry else Transform.identity()
-        count = len(grid.classes)
-        middles = (np.stack(np.meshgrid(*2 * [np.arange(count)]), axis=-1) + 0.5) * grid.resolution
-        flat = np.append(middles.reshape(-1, 2), np.zeros((count**2, 1)), axis=1) + grid.origin
-        x, y, _ = home.apply(flat).T
-        # Cells that do not touch the border, nor the end of what is told of it.
-        across, classes = np.abs(y - pose.position[1]) < 0.4, grid.classes.ravel()
-        hazard, floor = across & (x > 0.1) & (x < 0.3), across & (x < -0.1) & (x > -1.0)
-        rows.append(np.array([
-            pose.position[0],
-            np.isin(classes[hazard], (DROP, OBSTACLE)).mean(),
-            (classes[hazard] == GROUND).mean(),
-            (classes[floor] == GROUND).mean(),
-        ]))  # fmt: skip
+        rows.append(np.array([pose.position[0], *told(grid, home, pose.position[1])]))
     return rows, spent
+
+
+def told(grid: GroundGrid, home: Transform, side: float) -> list[float]:
+    """Shares of a hazard at x = 0 that are danger and ground, and of the floor that is ground."""
+    count = len(grid.classes)
+    middles = (np.stack(np.meshgrid(*2 * [np.arange(count)]), axis=-1) + 0.5) * grid.resolution
+    flat = np.append(middles.reshape(-1, 2), np.zeros((count**2, 1)), axis=1) + grid.origin
+    x, y, _ = home.apply(flat).T
+    # Cells that do not touch the border, nor the end of what is told of it.
+    across, classes = np.abs(y - side) < 0.4, grid.classes.ravel()
+    hazard, floor = across & (x > 0.1) & (x < 0.3), across & (x < -0.1) & (x > -1.0)
+    return [
+        np.isin(classes[hazard], (DROP, OBSTACLE)).mean(),
+        (classes[hazard] == GROUND).mean(),
+        (classes[floor] == GROUND).mean(),
+    ]
+
+
+def hour(sensor: Sensor, seed: int, minutes: int = 60) -> None:
+    """Drive to and fro before an edge, with stated poses that err anew in every image."""
+    there = [*driven(seed)]
+    poses, images = [*there, *there[20::-1]], []
+    for k, pose in enumerate(poses):
+        scene = Terrain('', [*HAZARDS['edge, 10 cm down'], *SURROUNDINGS], (FLOOR,), pose)
+        images.append((simulate_terrain(scene, sensor, seed=1000 * seed + k).depth, scene.up))
+    config = Config(sensor_height=HEIGHT + 0.01, fixed_frame='map')
+    draw, sequence, rows = np.random.default_rng([seed, 1]), SequenceSegmenter(config), []
+    mounted = Rotation.from_euler('xyz', [1, -1, 1], degrees=True)
+    sigma = [*3 * [np.radians(config.pose_turn_noise)], *3 * [config.pose_noise]]
+    for k in range(300 * minutes):
+        pose, (depth, up) = poses[k % len(poses)], images[k % len(poses)]
+        at = Transform(pose.rotation, pose.position).by(draw.normal(0, sigma))
+        begun, image = time.process_time(), RangeImage.from_depth(depth, sensor.camera)
+        found = sequence.segment(image, SECOND + k * SECOND // 5, mounted.apply(up), at)
+        spent = 1e3 * (time.process_time() - begun)
+        # All of the edge is in the grid from here on.
+        if pose.position[0] > -2:
+            shares = told(found.grid, Transform.identity(), pose.position[1])
+            rows.append((spent, *shares))
+        if k % 1500 == 1499:
+            resident = int(Path('/proc/self/statm').read_text().split()[1]) * 4096 / 2**20
+            times, danger, called, floor = np.array(rows).T
+            print(
+                f'minute {k // 300 + 1}: {resident:.0f} MiB, {np.median(times):.0f} ms a frame, '
+                f'edge lost in {(danger < 0.5).sum()} of {len(rows)} frames, at most '
+                f'{called.max():.1%} of it ground, {floor.mean():.1%} of the floor kept',
+                flush=True,
+            )
+            rows.clear()
 
 
 def main(sensor: str, *seeds: str) -> None:
@@ -156,4 +196,7 @@ def main(sensor: str, *seeds: str) -> None:
 
 
 if __name__ == '__main__':
-    main(*sys.argv[1:])
+    if sys.argv[-1] == 'hour':
+        hour(SENSORS[sys.argv[1]](int(sys.argv[2])), int(sys.argv[2]))
+    else:
+        main(*sys.argv[1:])
