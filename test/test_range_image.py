@@ -155,11 +155,22 @@ def test_wider_integers_keep_what_is_far_and_lose_what_is_none():
     np.testing.assert_allclose(inverse, [[0, 0, 1 / 20]])
 
 
+def test_eight_bits_have_no_unit_but_the_stated_one():
+    depth = np.full((3, 4), 50, np.uint8)
+    with pytest.warns(UnitWarning, match='no unit'):
+        RangeImage.from_depth(depth, CAMERA)
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        image = RangeImage.from_depth(depth, CAMERA, 10 / 255)
+    np.testing.assert_allclose(image.points[..., 2], 500 / 255, rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     ('depth', 'scale', 'message'),
     [
         (np.zeros((3, 4, 3), np.uint16), None, 'one channel'),
-        (np.zeros((3, 4), np.uint8), None, 'int32 or float, not uint8'),
+        (np.zeros((3, 4), np.int64), None, 'floats, not int64'),
+        (np.zeros((3, 4), bool), None, 'floats, not bool'),
         (np.zeros((4, 4), np.uint16), None, '4x4'),
         (np.zeros((3, 4), np.uint16), 0.0, 'scale'),
         (np.zeros((3, 4), np.uint16), np.nan, 'scale'),

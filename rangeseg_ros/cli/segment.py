@@ -83,7 +83,7 @@ def command(
         result = replace(result, planes=with_roles(result.planes, config, result.up))
         write_frame(output, path.stem, image, result, files)
         if result.planes:
-            click.echo(f'{path}: {len(result.planes)} planes, {result.ground}')
+            click.echo(f'{path}: {len(result.planes)} planes, {result.ground or "in no unit"}')
         else:
             click.echo(f'{path}: no plane: {result.reason}')
         if not result.verdict.ok:

@@ -14,7 +14,7 @@ from rangeseg_ros.messages.images import shape_and_pages
 
 
 def read_depth(path: Path, shape: tuple[int, int] | None = None) -> NDArray:
-    """Depth image (H, W) of a 16-bit PNG or TIFF, or floating-point TIFF, in the unit of the file.
+    """Depth image (H, W) of a PNG or TIFF of 8 or 16 bits or floats, in the unit of the file.
 
     FileError: another kind of image or, before it is decoded, another size than `shape` (H, W).
     """
@@ -23,8 +23,6 @@ def read_depth(path: Path, shape: tuple[int, int] | None = None) -> NDArray:
         raise FileError(
             f'{path}: depth image must have one channel, not {image.shape[2]} (colour?)'
         )
-    if image.dtype.kind != 'f' and image.dtype.itemsize < 2:
-        raise FileError(f'{path}: depth image must be 16-bit or float, not {image.dtype}')
     return image
 
 

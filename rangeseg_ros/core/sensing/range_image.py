@@ -74,7 +74,7 @@ class RangeImage:
 
         Parameters
         ----------
-        depth : (H, W) uint16, int16, int32 or float, of either byte order
+        depth : (H, W) integers of 8 to 32 bits or floats, of either byte order
             Depth along the optical axis; 0, negative values and 65535 (integers), non-finite or
             <= 0 (floats) and what the mask of a masked array hides are invalid.
         camera : Camera
@@ -91,7 +91,8 @@ class RangeImage:
         Warns
         -----
         UnitWarning
-            More than half of the pixels are farther than 16 bits of millimetres reach.
+            More than half of the pixels are farther than 16 bits of millimetres reach. Or there
+            are 8 bits and no scale, as of a picture of depth.
         """
         array, hidden = _unmasked(depth)
         if array.ndim != 2:
@@ -100,11 +101,9 @@ class RangeImage:
             raise RangeImageError(
                 f'camera must be a Camera(width, height, fx, fy, cx, cy), not {camera!r:.60}'
             )
-        integers = array.dtype.kind in 'iu' and 2 <= array.itemsize <= 4
+        integers = array.dtype.kind in 'iu' and array.itemsize <= 4
         if not integers and array.dtype.kind != 'f':
-            raise RangeImageError(
-                f'depth image must be uint16, int16, int32 or float, not {array.dtype}'
-            )
+            raise RangeImageError(f'depth has 8 to 32 bits or is of floats, not {array.dtype}')
         height, width = array.shape
         if array.shape != camera.shape:
             raise RangeImageError(
@@ -112,6 +111,8 @@ class RangeImage:
             )
         if scale is None:
             scale = 0.001 if integers else 1.0
+            if array.itemsize == 1:
+                warnings.warn('depth of 8 bits has no unit', UnitWarning, stacklevel=2)
         if not (np.isfinite(scale) and scale > 0):
             raise RangeImageError(f'depth scale must be positive, not {scale}')
         if integers and array.dtype != np.uint16:
