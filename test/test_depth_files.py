@@ -105,7 +105,7 @@ def test_what_is_none_is_refused_in_one_line(depth, tmp_path):
         ('empty.npz', 'not a readable file of NumPy'),
         ('record.bag', 'rangeseg replay'),
         ('missing.ply', 'No such file'),
-        ('text2.npy', 'must be uint16'),
+        ('text2.npy', 'depth has 8 to 32 bits'),
     ):
         with pytest.raises(ValueError, match=words):
             read_frame(tmp_path / name, Intrinsics(fov=60))
