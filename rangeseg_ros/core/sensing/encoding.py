@@ -65,11 +65,10 @@ def encoding(image: RangeImage) -> float | None:
     off = np.log1p((share - 1 / (1 - _Q[:, None] * values)) ** 2 / variance)
     # Of a curved surface, neighbours tell the same: two blocks count as one.
     odds = (np.log1p(share**2 / variance) - off).sum(axis=1) / 2
-    odds[_Q == 0] += _CHANCE
     # Only a picture, of 8 bits, has another q.
     if odds.max() > ODDS and len(np.unique(image.inverse[image.valid])) > 2**8:
         odds[_Q != 0] = 0
-    return float(_Q[odds.argmax()]) if odds.max() > ODDS else None
+    return float(_Q[(odds + _CHANCE * (_Q == 0)).argmax()]) if odds.max() > ODDS else None
 
 
 def decoded(image: RangeImage, q: float) -> RangeImage:
