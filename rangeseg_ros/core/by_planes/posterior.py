@@ -3,7 +3,8 @@
 What a quadratic explains of the residuals of a plane, its bend, has three terms. Noise, the smooth
 distortion of the sensor and the bend of the surface itself make it, and each term is Gaussian with
 the sum of their variances. The last is log-normal; the posterior compares planes with curved
-surfaces, the likelihood of each integrated over it (Gauss-Hermite quadrature).
+surfaces, the likelihood of each integrated over it (Gauss-Hermite quadrature). Regions that touch
+and follow one quadratic are judged together, too.
 """
 
 from __future__ import annotations
@@ -155,7 +156,8 @@ def _evidence(
 
     The quadratic that is nearest to both planes differs from these by a crease. Regions that
     follow it leave their planes by the crease, planes by noise, as large as the plane leaves it;
-    whatever else bends them, like the distortion, is not along the crease.
+    whatever else bends them, like the distortion, is not along the crease. A test of separate
+    hypotheses (Cox, Proc. 4th Berkeley Symp. Math. Stat. Prob. 1, 1961).
     """
     system, odds = np.zeros((7, 6)), np.zeros(2)
     for cell in sums.cells[sums.start[b] : sums.start[b + 1]]:
