@@ -187,8 +187,7 @@ def _change(change: float, error: float) -> str:
 PAGE = """\
 # Ledger
 
-What each mechanism of the core costs, and what switching it off costs: `make ablate`, before every
-release. The mechanisms are in `.ci/mechanisms.py`; `.ci/ablate.py` says how they are measured.
+What each mechanism (`.ci/mechanisms.py`) costs and buys: `make ablate` (`.ci/ablate.py`).
 {frames}
 
 - *lines*, *constants*: of its modules or functions; *ms*: processor time it takes. Other columns:
