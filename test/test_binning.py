@@ -73,6 +73,8 @@ def test_a_jump_mixes_no_two_surfaces():
         bins = Bins.of(image_of(inverse), 2)
         found = bins.of_one_surface(np.full((60, 80), 0.01, np.float32)).inverse
         assert set(np.unique(found)) == {np.float32(0.5), np.float32(0.25)}
+        # Of two that are as large, the nearer one.
+        assert (found[:, 100] == (0.5 if edge == 201 else 0.25)).all()
     steep = image_of(np.maximum(CAMERA.rays @ [0.0, 0.7, 0.01], 0))
     bins = Bins.of(steep, 2)
     found = bins.of_one_surface(np.full((60, 80), 1e-4, np.float32)).inverse
