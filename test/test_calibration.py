@@ -125,6 +125,7 @@ def test_slope_that_is_no_error_of_the_range_is_learned():
 
 def test_frames_left_out_do_not_weigh_the_others():
     cells = seen(12, true_map())
+    assert cells.frames == 12
     first = cells.frame[cells.plane()] < 3
     other = cells._replace(inverse=np.where(first, 2 * cells.inverse**2, cells.inverse))
     one, two = (_blocks(each, cell_grid(CAMERA.shape)) for each in (cells, other))
