@@ -88,7 +88,7 @@ def test_no_axis_of_the_image_is_another_one(seen):
 
 
 def test_the_map_turns_with_its_frame():
-    """Poses in another fixed frame: the same planes, errors and solution, moved there."""
+    """Poses in another fixed frame, days later: the same planes, errors and solution there."""
     scene = kinect_room(701, 18, walk)
     sequence, random = SequenceSegmenter(Config()), np.random.default_rng(1)
     turn = Rotation.from_rotvec([0.7, -0.4, 1.1]).as_matrix()
@@ -104,7 +104,8 @@ def test_the_map_turns_with_its_frame():
         told = true.by(random.normal(0, [noise.turn] * 3 + [noise.shift] * 3))
         for plane_map, adjustment, frame_of_map in maps:
             pose = frame_of_map.after(told)
-            plane_map.add(found.labels, found.planes, image, pose, stamp)
+            later = stamp + (frame_of_map is moved) * 10**15
+            plane_map.add(found.labels, found.planes, image, pose, later)
             adjustment.add(plane_map.sighting)
     (planes, solution), (others, other) = (
         (each.planes, adjustment.solve(each.planes, each.successors))
