@@ -1,4 +1,4 @@
-"""What a result may not depend on: the unit of length, which axis is x, the frame of a map."""
+"""What results may not depend on: unit of length, axes and sides of the image, frame of a map."""
 
 from dataclasses import replace
 
@@ -18,6 +18,9 @@ from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room, walk
 from rangeseg_ros.simulation.sensors.kinect import Kinect
+from rangeseg_ros.simulation.sensors.sensor import resize
+from rangeseg_ros.simulation.terrain.frame import simulate_terrain
+from rangeseg_ros.simulation.terrain.kinds import stated, terrain_scene
 
 LENGTHS = 'distance', 'rms', 'centroid', 'extents'
 SWAPPED = [1, 0, 2]
@@ -126,3 +129,30 @@ def test_the_map_turns_with_its_frame():
             assert twin.area == pytest.approx(plane.area)
     for pose, twin in zip(solution.poses, other.poses, strict=True):
         np.testing.assert_allclose(twin.shift, moved.after(pose).shift, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    'kind', ['clutter', 'waves', 'stairs up', 'stairs down', 'ramp up', 'bridge', 'rolled']
+)
+def test_a_mirror_swaps_left_and_right(kind):
+    """Ground, obstacles, drops, heights, grid and stairs of the mirrored image."""
+    scene = terrain_scene(kind, 3)
+    camera = resize(Kinect(3).camera, 320, 240)
+    mirrored = replace(camera, cx=camera.width - 1 - camera.cx)
+    up, height = stated(scene, 3)
+    depth = simulate_terrain(scene, Kinect(3), camera, 3).depth
+    found = []
+    for seen, rays, side in (depth, camera, 1), (depth[:, ::-1].copy(), mirrored, -1):
+        axes = dict(zip(('up_x', 'up_y', 'up_z'), map(float, up * (side, 1, 1)), strict=True))
+        result = Segmenter(Config(**axes, sensor_height=height)).segment(
+            RangeImage.from_depth(seen, rays)
+        )
+        found.append((result.terrain[:, ::side], result.height[:, ::side], result.grid.classes))
+        found[-1] += ([str(stairs) for stairs in result.stairs],)
+    (classes, heights, grid, stairs), (others, other_heights, other_grid, other_stairs) = found
+    # Where a surface ends, rounding decides which side a few pixels are on.
+    assert (classes != others).mean() < 1e-3
+    same = np.isfinite(heights) & np.isfinite(other_heights)
+    assert np.quantile(np.abs(heights - other_heights)[same], 0.99) < 1e-3
+    assert (grid != other_grid[::-1]).mean() < 2e-3
+    assert stairs == other_stairs
