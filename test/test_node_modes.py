@@ -122,11 +122,6 @@ def test_every_frame_is_made_again_with_what_it_records(bench, depth):
     assert bench.set_parameters(work_budget=1.0)[0].successful
 
 
-def test_a_rate_is_for_the_shortcuts_of_planes(bench):
-    result = bench.set_parameters(atomically=True, target_rate=5.0, method='normals')
-    assert not result.successful and 'target_rate is for method planes' in result.reason
-
-
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
 PITCH = np.radians(35)
 UP = np.array([0, -np.cos(PITCH), -np.sin(PITCH)])

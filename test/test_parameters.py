@@ -1,54 +1,37 @@
 """Parts of the node over rclpy: parameters, settings in use, events, what /diagnostics says."""
 
 import os
+import time
 from dataclasses import fields
 from pathlib import Path
-
-import pytest
-
-pytest.importorskip('rclpy')
-
 from threading import Event, Thread
-
-import pytest
-import rclpy
-from rclpy.exceptions import InvalidParameterTypeException
-from rclpy.node import Node
-from rclpy.parameter import Parameter
-from ros_bench import DEPTH  # noqa: F401 - gives DDS a domain of its own
-
-from rangeseg_ros import Config, ConfigError
-from rangeseg_ros.io.params import read_config, read_params
-from rangeseg_ros.ros.parameters import NodeConfig, bind
-
-pytest.importorskip('rclpy')
-
-import pytest
-
-from rangeseg_ros.compilation.preparation import FIRST
-from rangeseg_ros.ros import settings
-from rangeseg_ros.ros.settings import Settings
-
-pytest.importorskip('rclpy')
-
-import time
 from types import SimpleNamespace
 
 import pytest
-from rclpy.event_handler import PublisherEventCallbacks
-from rclpy.executors import SingleThreadedExecutor
-from std_msgs.msg import Empty
-
-from rangeseg_ros.ros.depth_input import PROFILE_VARIABLE, SEGMENT_SIZE, DepthInput
-from rangeseg_ros.ros.throttled_events import ThrottledCallbackGroup
 
 pytest.importorskip('rclpy')
 
+import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.exceptions import InvalidParameterTypeException
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from ros_bench import values_of  # and a domain of its own for DDS
+from std_msgs.msg import Empty
 
+from rangeseg_ros import Config, ConfigError
+from rangeseg_ros.compilation.preparation import FIRST
 from rangeseg_ros.core.sensing.verdict import Verdict
+from rangeseg_ros.io.params import read_config, read_params
+from rangeseg_ros.ros import settings, throttled_events
 from rangeseg_ros.ros.counting import Losses, Window
+from rangeseg_ros.ros.depth_input import PROFILE_VARIABLE, SEGMENT_SIZE, DepthInput
 from rangeseg_ros.ros.diagnostics import FrameStatistics
+from rangeseg_ros.ros.parameters import NodeConfig, bind
+from rangeseg_ros.ros.settings import Settings
+from rangeseg_ros.ros.throttled_events import ThrottledCallbackGroup
 
 PARAMS = Path(__file__).parents[1] / 'params' / 'segment_planes.yaml'
 
@@ -98,15 +81,17 @@ def test_start_with_other_values(node_with):
     assert bind(node, lambda config: None) == expected
 
 
-@pytest.mark.parametrize('bad', [{'method': 'magic'}, {'direction_count': 306}])
-def test_bad_start_values_are_named(node_with, bad):
-    with pytest.raises(ConfigError, match=next(iter(bad))):
-        bind(node_with(**bad), lambda config: None)
-
-
-def test_start_value_of_another_type_is_named(node_with):
-    with pytest.raises(InvalidParameterTypeException, match='smoothness'):
-        bind(node_with(smoothness=True), lambda config: None)
+@pytest.mark.parametrize(
+    ('name', 'value', 'error'),
+    [
+        ('method', 'magic', ConfigError),
+        ('direction_count', 306, ConfigError),
+        ('smoothness', True, InvalidParameterTypeException),
+    ],
+)
+def test_bad_start_values_are_named(node_with, name, value, error):
+    with pytest.raises(error, match=name):
+        bind(node_with(**{name: value}), lambda config: None)
 
 
 def test_changes_apply_all_or_none(node_with):
@@ -125,6 +110,7 @@ def test_changes_apply_all_or_none(node_with):
         ({'min_pixels': 3, 'smoothness': float('nan')}, 'smoothness'),
         ({'min_pixels': 3, 'direction_count': 225}, 'direction_count'),
         ({'min_pixels': 3, 'smoothness': 'much'}, 'DOUBLE'),
+        ({'target_rate': 5.0, 'method': 'normals'}, 'target_rate is for method planes'),
     ]:
         result = change(**values)
         assert not result.successful and reason in result.reason
@@ -133,15 +119,9 @@ def test_changes_apply_all_or_none(node_with):
     assert change(work_budget=0.5).successful and not change(method='normals').successful
     assert change(method='normals', work_budget=1.0).successful
     assert applied[2:] == [NodeConfig(smoothness=10.0, min_pixels=2, method='normals')]
-
-
-def test_parameters_of_others_are_none_of_ours(node_with):
-    applied = []
-    node = node_with()
-    bind(node, applied.append)
+    # Parameters of others are none of ours.
     node.declare_parameter('qos_of_another', 1)
-    assert node.set_parameters([Parameter('qos_of_another', value=2)])[0].successful
-    assert not applied
+    assert change(qos_of_another=2).successful and len(applied) == 3
 
 
 def test_shipped_parameter_file_holds_the_defaults(context):
@@ -173,6 +153,10 @@ class Compilation:
         self.came.append(outputs)
 
 
+def settings_of(config=NodeConfig(), changed=lambda: None):  # noqa: B008
+    return Settings(config, lambda progress: None, changed)
+
+
 def test_the_first_frames_wait_for_labels_and_other_outputs_for_their_kernels(monkeypatch):
     compilation = Compilation(monkeypatch)
     came = compilation.came
@@ -182,7 +166,7 @@ def test_the_first_frames_wait_for_labels_and_other_outputs_for_their_kernels(mo
         came.append(used.ready_for('terrain'))
 
     config = NodeConfig()
-    used = Settings(config, lambda progress: None, lambda: None)
+    used = settings_of(config)
     assert used.in_use() is config
     publication = Thread(target=publish)
     publication.start()
@@ -195,8 +179,7 @@ def test_the_first_frames_wait_for_labels_and_other_outputs_for_their_kernels(mo
 
 
 def test_what_needs_no_other_kernels_is_in_use_at_once(monkeypatch):
-    compilation = Compilation(monkeypatch)
-    used = Settings(NodeConfig(), lambda progress: None, lambda: None)
+    compilation, used = Compilation(monkeypatch), settings_of()
     first = used.in_use()
     other, normals = NodeConfig(min_pixels=500), NodeConfig(method='normals')
     used.want(other)
@@ -218,7 +201,7 @@ def test_what_is_asked_for_last_is_in_use_in_the_end(monkeypatch):
             release.wait()
 
     monkeypatch.setattr(settings, 'prepare', prepare)
-    used = Settings(first, lambda progress: None, changed.set)
+    used = settings_of(first, changed.set)
     assert used.in_use() is first and used.ready_for('terrain')
     used.want(normals)
     begun.wait()
@@ -237,7 +220,7 @@ def test_what_is_asked_for_last_is_in_use_in_the_end(monkeypatch):
 def test_whoever_waits_is_let_go_at_the_end(monkeypatch):
     release = Event()
     monkeypatch.setattr(settings, 'prepare', lambda *arguments: release.wait())
-    used = Settings(NodeConfig(), lambda progress: None, lambda: None)
+    used = settings_of()
     used.close()
     assert used.in_use() is None
     assert not used.ready_for('labels')
@@ -245,8 +228,7 @@ def test_whoever_waits_is_let_go_at_the_end(monkeypatch):
 
 
 def test_what_a_robot_stops_for_comes_first_once_its_kernels_are_there(monkeypatch):
-    compilation = Compilation(monkeypatch)
-    used = Settings(NodeConfig(), lambda progress: None, lambda: None)
+    compilation, used = Compilation(monkeypatch), settings_of()
     assert used.in_use()
     names = ['labels', 'normals', 'drops']
     assert used.ready_first(names) == names
@@ -268,11 +250,9 @@ def test_events_wait_while_messages_come(context):
     executor.add_node(node)
 
     def listen():
-        """The listener, once the publisher has it."""
-        subscription = other.create_subscription(Empty, 'topic', lambda message: None, 5)
+        other.create_subscription(Empty, 'topic', lambda message: None, 5)
         while not publisher.get_subscription_count():
             executor.spin_once(timeout_sec=0.01)
-        return subscription
 
     def spin_until_it_came():
         while not came:
@@ -297,9 +277,7 @@ def test_the_interval_is_kept(monkeypatch):
     event, looked = Event(), []
     group.add_entity(event)
     for now in (5.0, 5.05, 5.09, 5.1, 5.15, 5.25):
-        monkeypatch.setattr(
-            'rangeseg_ros.ros.throttled_events.time.monotonic', lambda now=now: now
-        )
+        monkeypatch.setattr(throttled_events.time, 'monotonic', lambda now=now: now)
         group.message_came()
         looked.append(group.can_execute(event))
     assert looked == [True, False, False, True, False, True]
@@ -333,9 +311,8 @@ def status(**found):
 def test_ground_and_stairs_are_told():
     told = {'ground': 'ground 1.20 m below, confidence 0.98', 'stairs': ['up 4 x 0.17 / 0.28 m']}
     found = status(found=result(**told))
-    values = {value.key: value.value for value in found.values}
-    assert values['ground'] == 'ground 1.20 m below, confidence 0.98'
-    assert values['stairs'] == 'up 4 x 0.17 / 0.28 m'
+    assert values_of(found)['ground'] == told['ground']
+    assert values_of(found)['stairs'] == told['stairs'][0]
     assert found.level == DiagnosticStatus.OK
 
 
@@ -352,7 +329,7 @@ def test_a_wrong_unit_is_an_error_and_an_enlarged_image_a_warning():
     ):
         found = status(found=result(verdict=Verdict((reason,), ('What it is.',))))
         assert found.level == level and found.message == 'What it is.'
-        assert {value.key: value.value for value in found.values}['input'] == 'What it is.'
+        assert values_of(found)['input'] == 'What it is.'
 
 
 def test_lost_messages_are_a_warning_with_their_share_and_what_helps():

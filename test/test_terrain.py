@@ -44,17 +44,26 @@ def box_at(ahead, size, centre=0.0):
     return Piece(box((length, width, height), np.eye(3), place), OBSTACLE, height)
 
 
-def found(terrain, height=HEIGHT, seed=0, **parameters):
-    """What is found of a scene, with up off by 1 degree per axis, and the truth."""
-    frame = simulate_terrain(terrain, Kinect(), CAMERA, seed)
-    up = Rotation.from_euler('xyz', [1, -1, 1], degrees=True).apply(terrain.up)
-    config = Config(
-        **dict(zip(('up_x', 'up_y', 'up_z'), map(float, up), strict=True)),
-        sensor_height=height,
-        **parameters,
-    )
+def stated_to_be(up, height, **parameters):
+    directions = dict(zip(('up_x', 'up_y', 'up_z'), map(float, up), strict=True))
+    return Config(**directions, sensor_height=height, **parameters)
+
+
+def up_of(terrain):
+    """Off by 1 degree per axis."""
+    return Rotation.from_euler('xyz', [1, -1, 1], degrees=True).apply(terrain.up)
+
+
+def found(terrain, height=HEIGHT, **parameters):
+    """What is found of a scene, and the truth."""
+    frame = simulate_terrain(terrain, Kinect(), CAMERA)
     image = RangeImage.from_depth(frame.depth, CAMERA)
+    config = stated_to_be(up_of(terrain), height, **parameters)
     return image, Segmenter(config).segment(image), frame
+
+
+def in_the_world(points, terrain):
+    return points @ terrain.pose.rotation.T + terrain.pose.position
 
 
 def share(result, frame, true, called):
@@ -100,10 +109,7 @@ def test_a_curb_is_an_obstacle_as_a_whole_though_its_side_fades_with_distance():
     """Seen along it, a side of 6 cm is lost in what the ground may rise by between neighbours."""
     terrain, sensor = terrain_scene('curb', 930024), Kinect()
     frame = simulate_terrain(terrain, sensor, seed=930024)
-    up, height = stated(terrain, 930024)
-    config = Config(
-        **dict(zip(('up_x', 'up_y', 'up_z'), map(float, up), strict=True)), sensor_height=height
-    )
+    config = stated_to_be(*stated(terrain, 930024))
     result = Segmenter(config).segment(RangeImage.from_depth(frame.depth, sensor.camera))
     assert share(result, frame, OBSTACLE, OBSTACLE) > 0.95
     assert share(result, frame, GROUND, GROUND) > 0.98
@@ -136,7 +142,7 @@ def test_crossings_lie_on_the_ground_continued():
     terrain = scene(*drop_of(0.3))
     image, result, _ = found(terrain)
     points = drops(image, result.ground)
-    world = points[:, :3] @ terrain.pose.rotation.T + terrain.pose.position
+    world = in_the_world(points[:, :3], terrain)
     near = points[:, 2] < 2.5
     assert near.sum() > 500
     assert np.abs(world[near, 2]).max() < 0.05
@@ -144,50 +150,48 @@ def test_crossings_lie_on_the_ground_continued():
     assert (points[:, 3] < 0).all()
 
 
+def pit(begin, end):
+    """Ten centimetres deep, of which nothing is measured."""
+    return (
+        Piece(slab(-3, begin, 0, 0, ALL), GROUND),
+        Piece(slab(end, 12, 0, 0, ALL), GROUND),
+        Piece(slab(begin, end, -0.1, -0.1, ALL), DROP, 0.1, 'nothing'),
+    )
+
+
 @pytest.mark.parametrize('find', [drops, unseen])
 @pytest.mark.parametrize('edge', [1.7, 3.0])
 def test_crossings_leave_no_cell_of_a_costmap_free_beyond_an_edge(edge, find):
     """Cells of 5 cm, as far away as drops must be found; one more or less along the view."""
-    pit = (
-        Piece(slab(-3, edge, 0, 0, ALL), GROUND),
-        Piece(slab(edge + 0.9, 12, 0, 0, ALL), GROUND),
-        Piece(slab(edge, edge + 0.9, -0.1, -0.1, ALL), DROP, 0.1, 'nothing'),
-    )
-    terrain = scene(*(drop_of(0.3, edge) if find is drops else pit))
+    terrain = scene(*(drop_of(0.3, edge) if find is drops else pit(edge, edge + 0.9)))
     image, result, _ = found(terrain)
-    points = find(image, result.ground)[:, :3]
-    world = points @ terrain.pose.rotation.T + terrain.pose.position
+    world = in_the_world(find(image, result.ground)[:, :3], terrain)
     lethal = {(x + n, y) for x, y in np.floor(world[:, :2] / 0.05).astype(int) for n in (-1, 0, 1)}
     first = round(edge / 0.05) + 2
     assert {(x, y) for x in range(first, first + 6) for y in range(-10, 10)} <= lethal
 
 
 def test_a_pit_without_a_measurement_is_unseen_and_no_ground():
-    hidden = (
-        Piece(slab(-3, 1.5, 0, 0, ALL), GROUND),
-        Piece(slab(2.2, 12, 0, 0, ALL), GROUND),
-        Piece(slab(1.5, 2.2, -0.1, -0.1, ALL), DROP, 0.1, 'nothing'),
-    )
-    terrain = scene(*hidden)
+    terrain = scene(*pit(1.5, 2.2))
     image, result, frame = found(terrain)
     assert (result.terrain[frame.depth == 0] == UNKNOWN).all()
     points = unseen(image, result.ground)
-    world = points[:, :3] @ terrain.pose.rotation.T + terrain.pose.position
+    world = in_the_world(points[:, :3], terrain)
     inside = (world[:, 0] > 1.45) & (world[:, 0] < 2.3)
     assert inside.sum() > 500 and np.isnan(points[:, 3]).all()
     assert np.abs(world[inside, 2]).max() < 0.05
     # A cloud does not say where it looked: what it saw around tells.
-    up = Rotation.from_euler('xyz', [1, -1, 1], degrees=True).apply(terrain.up)
-    config = Config(up_x=up[0], up_y=up[1], up_z=up[2], sensor_height=HEIGHT)
-    cloud = cloud_of(image.points)
+    cloud, config = cloud_of(image.points), stated_to_be(up_of(terrain), HEIGHT)
     others = unseen(cloud, Segmenter(config).segment(cloud).ground)
-    there = others[:, :3] @ terrain.pose.rotation.T + terrain.pose.position
+    there = in_the_world(others[:, :3], terrain)
     within = (there[:, 0] > 1.45) & (there[:, 0] < 2.3)
     assert within.sum() > 0.8 * inside.sum() and np.abs(there[within, 2]).max() < 0.05
-    lines = [line @ terrain.pose.rotation.T + terrain.pose.position
-             for line in outlines(image, result.ground)]  # fmt: skip
-    edge = np.concatenate(lines)
+    edge = in_the_world(np.concatenate(outlines(image, result.ground)), terrain)
     assert (np.abs(edge[:, 0] - 1.5) < 0.06).sum() > 1
+
+
+def image_of(terrain):
+    return RangeImage.from_depth(simulate_terrain(terrain, Kinect(), CAMERA).depth, CAMERA)
 
 
 def test_what_was_the_ground_stays_it_while_it_is_out_of_view():
@@ -197,23 +201,16 @@ def test_what_was_the_ground_stays_it_while_it_is_out_of_view():
     landing = Piece(slab(-3, 12, -0.5, -0.5, ALL), DROP, 0.5)
     wall = Piece(box((1, 20, 12), np.eye(3), (1.4, 0, 0)), OBSTACLE, 4.0)
     views = {
-        name: scene(*pieces, pitch=pitch)
-        for name, pieces, pitch in (
-            ('floor', (floor,), 35),
-            ('table', (table, floor), 35),
-            ('wall', (wall, floor), 0),
-            ('landing', (landing,), 35),
-        )
+        'floor': scene(floor, pitch=35),
+        'table': scene(table, floor, pitch=35),
+        'wall': scene(wall, floor, pitch=0),
+        'landing': scene(landing, pitch=35),
     }
-    images = {
-        name: RangeImage.from_depth(simulate_terrain(view, Kinect(), CAMERA).depth, CAMERA)
-        for name, view in views.items()
-    }
-    ups = {name: view.up for name, view in views.items()}
+    images = {name: image_of(view) for name, view in views.items()}
     sequence = SequenceSegmenter(Config())
 
     def ground_at(name, second):
-        return sequence.segment(images[name], int(1e9 * second), ups[name]).ground
+        return sequence.segment(images[name], int(1e9 * second), views[name].up).ground
 
     def share(name, second, class_):
         return (ground_at(name, second).classes[images[name].valid] == class_).mean()
@@ -337,8 +334,7 @@ def test_ground_leads_over_gaps_that_the_robot_crosses(gap, kept):
 def test_without_a_height_one_ground_in_ten_may_lie_behind_a_step():
     """Neither an image nor those before it tell; a height that is stated does."""
     floor = scene(Piece(FLOOR, GROUND))
-    image = RangeImage.from_depth(simulate_terrain(floor, Kinect(), CAMERA).depth, CAMERA)
-    told = []
+    image, told = image_of(floor), []
     for height in (0.0, HEIGHT):
         sequence = SequenceSegmenter(Config(sensor_height=height))
         results = [sequence.segment(image, k * 10**8, floor.up) for k in range(1, 4)]

@@ -10,9 +10,7 @@ from planes_of_labels import fit_planes
 from scipy.spatial.transform import Rotation
 from tracks import ids_of_faces, track_figures
 
-from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros import Camera, Config, RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.tracking.tracker import Tracker, Tracks, _camera_motion
 from rangeseg_ros.simulation.render import simulate
@@ -49,34 +47,32 @@ def ids(tracker, found, stamp=0):
     return [plane.id for plane in tracker.track(*found, stamp)]
 
 
-def stay():
-    """Three planes that fix the motion of the camera, in the corners of the image."""
-    return [
-        (slice(90, 120), slice(0, 160), FLOOR),
-        (slice(0, 40), slice(0, 100), WALL),
-        (slice(0, 40), slice(110, 160), SIDE),
-    ]
-
-
 ALL = slice(None)
-MIDDLE = (slice(50, 80), slice(50, 100))
+GROUND = slice(90, 120), ALL, FLOOR
+STAY = GROUND, (slice(0, 40), slice(0, 100), WALL), (slice(0, 40), slice(110, 160), SIDE)
+"""Three planes that fix the motion of the camera, in the corners of the image."""
+MIDDLE = slice(50, 80), slice(50, 100)
+
+
+def wall(first, last):
+    return slice(0, 80), slice(first, last), WALL
 
 
 def test_ids_follow_the_planes_not_the_labels():
     tracker = Tracker()
-    assert ids(tracker, frame(*stay())) == [1, 2, 3]
-    assert ids(tracker, frame(*stay()[::-1])) == [3, 2, 1]
+    assert ids(tracker, frame(*STAY)) == [1, 2, 3]
+    assert ids(tracker, frame(*STAY[::-1])) == [3, 2, 1]
 
 
 def test_a_hidden_plane_moves_along_with_the_camera():
     # Over 20 frames the camera turns 20 degrees and comes 0.4 m nearer, so that the equation of
     # the hidden box becomes another one altogether.
     tracker = Tracker()
-    assert ids(tracker, frame(*stay(), (*MIDDLE, BOX))) == [1, 2, 3, 4]
+    assert ids(tracker, frame(*STAY, (*MIDDLE, BOX))) == [1, 2, 3, 4]
     for k in range(1, 21):
         rotation = Rotation.from_euler('xy', [k / 2, k], degrees=True).as_matrix()
         pose = rotation, np.array([0, 0, 0.02 * k])
-        view = [(rows, columns, moved(plane, *pose)) for rows, columns, plane in stay()]
+        view = [(rows, columns, moved(plane, *pose)) for rows, columns, plane in STAY]
         if k < 20:
             assert ids(tracker, frame(*view)) == [1, 2, 3]
     box = moved(BOX, *pose)
@@ -92,7 +88,7 @@ def test_what_moves_by_itself_does_not_move_the_camera():
     shifts = []
     for nearer in (0.1, 0.3, 0.6):
         box = (*MIDDLE, (*BOX[:3], BOX[3] - nearer))
-        first, second = frame(*stay(), (*MIDDLE, BOX)), frame(*stay(), box)
+        first, second = frame(*STAY, (*MIDDLE, BOX)), frame(*STAY, box)
         then, now = (Tracks.of(planes, labels) for labels, planes in (first, second))
         pairs = np.arange(4), np.arange(4)
         rotation, shift = _camera_motion(then, now, pairs, np.full(6, 1.0), None)
@@ -102,28 +98,19 @@ def test_what_moves_by_itself_does_not_move_the_camera():
 
 def test_another_plane_in_the_same_pixels_is_new():
     tracker = Tracker()
-    assert ids(tracker, frame(*stay(), (*MIDDLE, BOX))) == [1, 2, 3, 4]
+    assert ids(tracker, frame(*STAY, (*MIDDLE, BOX))) == [1, 2, 3, 4]
     nearer = (*BOX[:3], BOX[3] - 0.4)
-    assert ids(tracker, frame(*stay(), (*MIDDLE, nearer))) == [1, 2, 3, 5]
+    assert ids(tracker, frame(*STAY, (*MIDDLE, nearer))) == [1, 2, 3, 5]
 
 
 def test_the_largest_part_keeps_the_id_and_the_parts_theirs():
     tracker = Tracker()
-    whole = frame((slice(0, 80), slice(0, 160), WALL), (slice(90, 120), slice(0, 160), FLOOR))
-    split = frame(
-        (slice(0, 80), slice(0, 50), WALL),
-        (slice(0, 80), slice(70, 160), WALL),
-        (slice(90, 120), slice(0, 160), FLOOR),
-    )
+    whole = frame(wall(0, 160), GROUND)
     assert ids(tracker, whole) == [1, 2]
-    assert ids(tracker, split) == [3, 1, 2]
+    assert ids(tracker, frame(wall(0, 50), wall(70, 160), GROUND)) == [3, 1, 2]
     # The occluder moves on: the part with the first id becomes the smaller one, and keeps it.
     for edge in range(50, 110, 6):
-        now = frame(
-            (slice(0, 80), slice(0, edge), WALL),
-            (slice(0, 80), slice(edge + 20, 160), WALL),
-            (slice(90, 120), slice(0, 160), FLOOR),
-        )
+        now = frame(wall(0, edge), wall(edge + 20, 160), GROUND)
         assert ids(tracker, now) == [3, 1, 2]
     # Merged, it is the part that overlaps most; split again, both parts have their ids.
     assert ids(tracker, whole) == [3, 2]
@@ -131,68 +118,51 @@ def test_the_largest_part_keeps_the_id_and_the_parts_theirs():
 
 
 def test_a_surface_keeps_its_id_through_its_parts():
-    def view(*columns):
-        return frame(*((slice(0, 80), c, WALL) for c in columns), (slice(90, 120), ALL, FLOOR))
-
     tracker = Tracker()
 
-    def surfaces(found):
-        return [(p.id, p.surface) for p in tracker.track(*found, 0)]
+    def surfaces(*walls):
+        return [(p.id, p.surface) for p in tracker.track(*frame(*walls, GROUND), 0)]
 
-    left, right = slice(0, 60), slice(80, 160)
-    assert surfaces(view(left)) == [(1, 1), (2, 2)]
-    assert surfaces(view(left, right)) == [(1, 1), (3, 1), (2, 2)]
-    assert surfaces(view(right)) == [(3, 1), (2, 2)]
-    assert surfaces(view(right)) == [(3, 1), (2, 2)]
-    assert surfaces(view(left, right)) == [(1, 1), (3, 1), (2, 2)]
+    left, right = wall(0, 60), wall(80, 160)
+    assert surfaces(left) == [(1, 1), (2, 2)]
+    assert surfaces(left, right) == [(1, 1), (3, 1), (2, 2)]
+    assert surfaces(right) == [(3, 1), (2, 2)]
+    assert surfaces(right) == [(3, 1), (2, 2)]
+    assert surfaces(left, right) == [(1, 1), (3, 1), (2, 2)]
 
 
 def test_surfaces_taken_for_one_come_apart_with_their_ids():
     tracker = Tracker()
-    labels, planes = frame(*stay())
+    labels, planes = frame(*STAY)
 
     def surfaces(*groups):
         grouped = [replace(p, surface=g) for p, g in zip(planes, groups, strict=True)]
         return [p.surface for p in tracker.track(labels, grouped, 0)]
 
-    assert surfaces(1, 2, 3) == [1, 2, 3]
-    assert surfaces(1, 1, 3) == [1, 1, 3]
-    assert surfaces(1, 2, 3) == [1, 2, 3]
-    assert surfaces(1, 2, 2) == [1, 2, 2]
-    assert surfaces(1, 2, 3) == [1, 2, 3]
+    for groups in ([1, 2, 3], [1, 1, 3], [1, 2, 3], [1, 2, 2], [1, 2, 3]):
+        assert surfaces(*groups) == groups
 
 
 def test_parts_far_apart_are_not_renamed():
     left, right = ((slice(50, 80), slice(a, a + 24), BOX) for a in (10, 120))
     tracker = Tracker()
-    assert ids(tracker, frame(*stay(), left, right)) == [1, 2, 3, 4, 5]
-    assert ids(tracker, frame(*stay(), right)) == [1, 2, 3, 5]
+    assert ids(tracker, frame(*STAY, left, right)) == [1, 2, 3, 4, 5]
+    assert ids(tracker, frame(*STAY, right)) == [1, 2, 3, 5]
 
 
 def test_two_bad_pairs_are_not_worth_more_than_a_sure_one():
     # On one surface everything may be everything. The large part could take the id of the scrap
     # that is gone, and leave its own to the scrap that is new.
     tracker = Tracker()
-    left, right = (slice(0, 80), slice(0, 15)), (slice(0, 80), slice(145, 160))
-    assert ids(tracker, frame((*left, WALL), (slice(0, 80), slice(20, 140), WALL))) == [1, 2]
-    assert ids(tracker, frame((*right, WALL), (slice(0, 80), slice(26, 140), WALL))) == [3, 2]
+    assert ids(tracker, frame(wall(0, 15), wall(20, 140))) == [1, 2]
+    assert ids(tracker, frame(wall(145, 160), wall(26, 140))) == [3, 2]
 
 
 def test_a_sliver_does_not_give_its_id_to_what_swallows_it():
     tracker = Tracker()
-    sliver = (slice(0, 80), slice(0, 10), WALL)
-    floor = (slice(90, 120), slice(0, 160), FLOOR)
-    assert ids(tracker, frame(sliver, floor)) == [1, 2]
-    assert ids(tracker, frame(sliver, floor, (slice(0, 80), slice(20, 160), WALL))) == [1, 2, 3]
-    assert ids(tracker, frame((slice(0, 80), slice(0, 160), WALL), floor)) == [3, 2]
-
-
-def test_a_reset_begins_anew_without_reusing_ids():
-    tracker = Tracker()
-    assert ids(tracker, frame(*stay())) == [1, 2, 3]
-    tracker.reset()
-    assert ids(tracker, frame(*stay())) == [4, 5, 6]
-    assert ids(tracker, frame(*stay())) == [4, 5, 6]
+    assert ids(tracker, frame(wall(0, 10), GROUND)) == [1, 2]
+    assert ids(tracker, frame(wall(0, 10), GROUND, wall(20, 160))) == [1, 2, 3]
+    assert ids(tracker, frame(wall(0, 160), GROUND)) == [3, 2]
 
 
 @pytest.mark.parametrize('rate', [2, 30, 120])
@@ -200,19 +170,22 @@ def test_memory_is_of_seconds_at_any_rate(rate):
     for hidden, same in ((0.9, True), (1.1, False)):
         tracker, stamp = Tracker(Config(track_time=1.0)), 10**9
         box = (*MIDDLE, BOX)
-        assert ids(tracker, frame(*stay(), box), stamp) == [1, 2, 3, 4]
+        assert ids(tracker, frame(*STAY, box), stamp) == [1, 2, 3, 4]
         for k in range(1, round(hidden * rate) + 1):
-            assert ids(tracker, frame(*stay()), stamp + k * 10**9 // rate) == [1, 2, 3]
+            assert ids(tracker, frame(*STAY), stamp + k * 10**9 // rate) == [1, 2, 3]
         stamp += round((hidden + 0.02) * 1e9) + 10**9 // rate
         if rate > 2:
-            assert ids(tracker, frame(*stay(), box), stamp) == [1, 2, 3, 4 if same else 5]
+            assert ids(tracker, frame(*STAY, box), stamp) == [1, 2, 3, 4 if same else 5]
 
 
-def test_another_image_size_begins_anew():
+def test_a_reset_and_another_image_size_begin_anew_without_reusing_ids():
     tracker = Tracker()
-    labels, planes = frame(*stay())
+    labels, planes = frame(*STAY)
     assert ids(tracker, (labels, planes)) == [1, 2, 3]
     assert ids(tracker, (labels[::2, ::2], planes)) == [4, 5, 6]
+    tracker.reset()
+    assert ids(tracker, (labels[::2, ::2], planes)) == [7, 8, 9]
+    assert ids(tracker, (labels[::2, ::2], planes)) == [7, 8, 9]
 
 
 REGION = st.tuples(
