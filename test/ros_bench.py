@@ -198,15 +198,19 @@ class Bench:
     def reported(self, condition, publish, period=0.2, **waiting):
         """The first diagnostic status that satisfies the condition, while frames come."""
         self.received['diagnostics'].clear()
-        return self.repeat(publish, lambda: self._reported(condition), period, **waiting)
+
+        def found():
+            statuses = (report.status[0] for report in self.received['diagnostics'])
+            return next(filter(condition, statuses), None)
+
+        return self.repeat(publish, found, period, **waiting)
 
     def stream(self):
         """Publish images until one comes back, as best effort has no promise for the first."""
 
         def answer():
             sent.append(self.image())
-            self.camera_info.publish(self.info())
-            self.depth.publish(sent[-1])
+            self.send(sent[-1])
             self.spin(0.1)
             return next((image for image in sent if self.find('labels', image)), None)
 
@@ -238,25 +242,19 @@ class Bench:
     def image(self, depth=None, encoding='16UC1', **fields):
         """Depth image message, by default of two walls."""
         depth = corner_depth(self.camera) if depth is None else depth
-        message = Image(header=self.header(), encoding=encoding, step=depth.strides[0])
-        message.height, message.width = depth.shape
-        message.data = array('B', depth.tobytes())
-        for name, value in fields.items():
-            setattr(message, name, value)
-        return message
+        known = dict(zip(('height', 'width'), depth.shape, strict=True))
+        known |= {'header': self.header(), 'encoding': encoding, 'step': depth.strides[0]}
+        return Image(**{**known, 'data': array('B', depth.tobytes()), **fields})
 
     def info(self, camera=None, **fields):
         """CameraInfo message of the bench's camera."""
         camera = camera or self.camera
-        message = CameraInfo(header=self.header(), height=camera.height, width=camera.width)
-        message.k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
-        for name, value in fields.items():
-            setattr(message, name, value)
-        return message
+        known = {'header': self.header(), 'height': camera.height, 'width': camera.width}
+        return CameraInfo(**{**known, 'k': camera.matrix.ravel(), **fields})
 
     def labels_of(self, image):
         """Labels (H, W) of an image that was published."""
-        message = self.until(lambda: self.find('labels', image))
+        message = self.answer('labels', image)
         return np.frombuffer(message.data, np.uint16).reshape(message.height, message.width)
 
     def find(self, name, image):
@@ -264,23 +262,20 @@ class Bench:
         stamp = image.header.stamp
         return next((m for m in self.received[name] if m.header.stamp == stamp), None)
 
+    def answer(self, name, image):
+        """That message once it is there."""
+        return self.until(lambda: self.find(name, image))
+
     def status(self, condition):
         """The first diagnostic status from now on that satisfies the condition."""
-        self.received['diagnostics'].clear()
-        return self.until(lambda: self._reported(condition))
-
-    def _reported(self, condition):
-        statuses = (report.status[0] for report in self.received['diagnostics'])
-        return next(filter(condition, statuses), None)
+        return self.reported(condition, lambda: None)
 
     def set_parameters(self, atomically=False, **values):
         """Set parameters by the node's service; its results."""
         kind = SetParametersAtomically if atomically else SetParameters
-        parameters = [Parameter(name, value=value) for name, value in values.items()]
+        parameters = [Parameter(n, value=v).to_parameter_msg() for n, v in values.items()]
         self.until(self.clients[kind].service_is_ready)
-        future = self.clients[kind].call_async(
-            kind.Request(parameters=[p.to_parameter_msg() for p in parameters])
-        )
+        future = self.clients[kind].call_async(kind.Request(parameters=parameters))
         self.until(future.done)
         return future.result().result if atomically else future.result().results
 

@@ -31,6 +31,7 @@ pytestmark = pytest.mark.ros
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # The camera 1.2 m above the ground, 35 degrees down; base_link is 0.3 m above the ground.
 PITCH, HEIGHT, BASE = np.radians(35), 1.2, 0.3
+TURN = (Rotation.from_euler('y', PITCH) * Rotation.from_matrix(OPTICAL_IN_BODY)).as_quat()
 FRAMES = {'gravity_frame': 'base_footprint', 'target_frame': 'base_link', 'fixed_frame': 'odom'}
 
 
@@ -58,25 +59,20 @@ class Robot:
     def __init__(self, bench, kind):
         self.bench, self.kind = bench, kind
         self.moving = bench.node.create_publisher(kind, '/tf', 100)
-        self.static = bench.node.create_publisher(kind, '/tf_static', LATCHED)
-        turn = Rotation.from_euler('y', PITCH) * Rotation.from_matrix(OPTICAL_IN_BODY)
-        none = 0, 0, 0, 1
-        self.static.publish(
-            kind(
-                transforms=[
-                    transform('base_footprint', 'base_link', Time().to_msg(), none, (0, 0, BASE)),
-                    transform(
-                        'base_link', FRAME, Time().to_msg(), turn.as_quat(), (0, 0, HEIGHT - BASE)
-                    ),
-                ]
-            )
-        )
+        static = bench.node.create_publisher(kind, '/tf_static', LATCHED)
+        start, still = Time().to_msg(), (0, 0, 0, 1)
+        base = transform('base_footprint', 'base_link', start, still, (0, 0, BASE))
+        mount = transform('base_link', FRAME, start, TURN, (0, 0, HEIGHT - BASE))
+        static.publish(kind(transforms=[base, mount]))
+        bench.until(self.moving.get_subscription_count)
+        bench.until(static.get_subscription_count)
 
-    def at(self, stamp, x, yaw=0.0, z=0.0):
-        """Where the robot is: x metres along the odometry's x axis, z above it."""
-        turn = Rotation.from_euler('z', yaw).as_quat()
-        message = transform('odom', 'base_footprint', stamp, turn, (x, 0, z))
-        self.moving.publish(self.kind(transforms=[message]))
+    def around(self, stamp, x=0.0, z=0.0):
+        """The robot is x metres along the odometry's x axis, z above it, before and after."""
+        for seconds in (-0.02, 0.02):
+            place = later(stamp, seconds), (0, 0, 0, 1), (x, 0, z)
+            message = transform('odom', 'base_footprint', *place)
+            self.moving.publish(self.kind(transforms=[message]))
 
 
 def later(stamp, seconds):
@@ -86,14 +82,13 @@ def later(stamp, seconds):
 def test_what_is_missing_is_said_where_there_is_no_tf():
     if find_spec('tf2_msgs'):
         pytest.skip('tf2_msgs is installed')
-    frames = {'gravity_frame': 'base_footprint', 'fixed_frame': 'odom'}
-    bench = Bench(**frames, stall_timeout=60.0)
+    bench = Bench(gravity_frame='base_footprint', fixed_frame='odom', stall_timeout=60.0)
     with bench, bench.listening('labels'), bench.camera_on():
         assert bench.segment().any()
         status = bench.status(lambda s: 'tf2_msgs' in s.message)
         assert 'ros-jazzy-tf2-msgs' in status.message
-        values = values_of(status)
-        assert values['up from'].startswith('the parameters up_x, up_y, up_z; no base_foot')
+        told = values_of(status)['up from']
+        assert told.startswith('the parameters up_x, up_y, up_z; no base_foot')
 
 
 @pytest.fixture(scope='module')
@@ -117,10 +112,8 @@ def test_node_and_replay_place_the_same_planes_whatever_becomes_of_tf(tmp_path, 
     """
     camera, count, late, restart, jump = kinect_camera(160, 120), 10, 4, 6, 7
     depth = floor_depth(camera)
-    k = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1])
-    camera_turn = Rotation.from_euler('y', PITCH) * Rotation.from_matrix(OPTICAL_IN_BODY)
     recording = Recording()
-    still = 0, 'base_footprint', 'optical', camera_turn.as_quat(), (0, 0, HEIGHT)
+    still = 0, 'base_footprint', 'optical', TURN, (0, 0, HEIGHT)
     recording.add_transform(*still, static=True)
     groups = []
 
@@ -132,7 +125,7 @@ def test_node_and_replay_place_the_same_planes_whatever_becomes_of_tf(tmp_path, 
 
     for n in range(count):
         stamp = 10**18 + n * 60_000_000
-        recording.add_camera(stamp, 160, 120, k=k)
+        recording.add_camera(stamp, 160, 120, k=camera.matrix.ravel())
         recording.add_image(stamp, depth)
         # The last one is the first to tell where the image is, whatever comes first.
         group = sample(n, -10_000_000), sample(n - 1, 30_000_000), sample(n, 10_000_000)
@@ -148,8 +141,7 @@ def test_node_and_replay_place_the_same_planes_whatever_becomes_of_tf(tmp_path, 
 
     def message(stamp, parent, child, turn, shift):
         time = Time(nanoseconds=stamp).to_msg()
-        found = transform(parent, child, time, turn, shift)
-        return tf_messages(transforms=[found])
+        return tf_messages(transforms=[transform(parent, child, time, turn, shift)])
 
     with Bench(camera=camera, **settings) as bench, bench.listening(*topics), bench.camera_on():
         static = bench.node.create_publisher(tf_messages, '/tf_static', LATCHED)
@@ -164,15 +156,13 @@ def test_node_and_replay_place_the_same_planes_whatever_becomes_of_tf(tmp_path, 
             image.header.frame_id = 'optical'
             image.header.stamp = Time(nanoseconds=10**18 + n * 60_000_000).to_msg()
             if n == late:
-                bench.camera_info.publish(bench.info())
-                bench.depth.publish(image)
+                bench.send(image)
                 bench.spin(0.3)
                 assert not bench.find('planes', image)
             for sample in group:
                 moving.publish(message(*sample))
             if n != late:
-                bench.camera_info.publish(bench.info())
-                bench.depth.publish(image)
+                bench.send(image)
             bench.until(lambda n=n: len(bench.received['markers']) == n + 1)
         told = f'{outcome.mapped} planes in odom'
         bench.status(lambda status: values_of(status).get('map from') == told)
@@ -194,13 +184,9 @@ def test_without_an_up_there_is_no_terrain(tf_messages):
         image = bench.image(floor_depth(bench.camera, pitch))
         image.header.stamp = later(image.header.stamp, ahead)
         if robot:
-            for seconds in (-0.02, 0.02):
-                robot.at(later(image.header.stamp, seconds), 0.0, z=z)
-        bench.camera_info.publish(bench.info())
-        bench.depth.publish(image)
-        terrain, obstacles, grid = (
-            bench.until(lambda name=name: bench.find(name, image)) for name in topics
-        )
+            robot.around(image.header.stamp, z=z)
+        bench.send(image)
+        terrain, obstacles, grid = (bench.answer(name, image) for name in topics)
         ground = np.count_nonzero(np.frombuffer(terrain.data, np.uint8) == 1)
         return ground, obstacles.width, grid.data.count(0)
 
@@ -210,8 +196,6 @@ def test_without_an_up_there_is_no_terrain(tf_messages):
         status = bench.reported(lambda s: 'no terrain' in s.message, lambda: published(bench))
         assert status.level == DiagnosticStatus.ERROR and 'up is not known' in status.message
         robot = Robot(bench, tf_messages)
-        bench.until(robot.moving.get_subscription_count)
-        bench.until(robot.static.get_subscription_count)
         bench.repeat(lambda: None, lambda: published(bench, robot=robot)[0] > 0)
         ground, obstacles, free = published(bench)  # tf has stopped
         assert ground > 1000 and obstacles == 0 and free > 100
@@ -247,52 +231,38 @@ def test_without_an_up_there_is_no_terrain(tf_messages):
 def robot(tf_messages):
     topics = 'labels', 'planes', 'markers'
     with Bench(**FRAMES, tf_timeout=20.0) as bench, bench.listening(*topics), bench.camera_on():
-        robot = Robot(bench, tf_messages)
-        bench.until(robot.moving.get_subscription_count)
-        bench.until(robot.static.get_subscription_count)
-        yield robot
+        yield Robot(bench, tf_messages)
 
 
 def send(robot, x):
-    """An image between two transforms; planes and header of the answer."""
-    bench = robot.bench
-    image = bench.image(floor_depth(bench.camera))
-    stamp = image.header.stamp
-    bench.camera_info.publish(bench.info())
-    robot.at(later(stamp, -0.02), x)
-    robot.at(later(stamp, 0.02), x)
-    bench.depth.publish(image)
-    message = bench.until(lambda: bench.find('planes', image))
-    return planes_from_message(message), message.header
+    """An image between two transforms; the frame of the answer."""
+    image = robot.bench.image(floor_depth(robot.bench.camera))
+    robot.around(image.header.stamp, x)
+    robot.bench.send(image)
+    return robot.bench.answer('planes', image).header.frame_id
 
 
 def test_the_map_is_latched_and_in_the_fixed_frame(robot):
     bench = robot.bench
     for k in range(8):
         send(robot, 0.1 * k)
-    maps, markers = [], []
-    here = [
-        bench.node.create_subscription(PointCloud2, '/segment_planes/map', maps.append, LATCHED),
-        bench.node.create_subscription(
-            MarkerArray, '/segment_planes/map_markers', markers.append, LATCHED
-        ),
-    ]
+    maps, markers, late = [], [], []
+
+    def listen(kind, name, received):
+        topic = f'/segment_planes/{name}'
+        return bench.node.create_subscription(kind, topic, received.append, LATCHED)
+
+    here = [listen(PointCloud2, 'map', maps), listen(MarkerArray, 'map_markers', markers)]
     try:
         places = itertools.count(8)
         # Published once a second.
         bench.repeat(lambda: send(robot, 0.1 * next(places)), lambda: len(maps) > 1 and markers)
         assert maps[-1].header.frame_id == 'odom'
-        planes = planes_from_message(maps[-1])
-        assert len(planes) == 1
-        assert planes['normal_z'][0] == pytest.approx(1, abs=0.01)
-        assert planes['distance'][0] == pytest.approx(0, abs=0.01)
+        (plane,) = planes_from_message(maps[-1])
+        found = plane['normal_z'], plane['distance']
+        assert found == pytest.approx((1, 0), abs=0.01)
         # Whoever comes later has the last one.
-        late = []
-        here.append(
-            bench.node.create_subscription(
-                PointCloud2, '/segment_planes/map', late.append, LATCHED
-            )
-        )
+        here.append(listen(PointCloud2, 'map', late))
         bench.until(lambda: late and late[-1] == maps[-1])
     finally:
         for subscription in here:
@@ -302,20 +272,17 @@ def test_the_map_is_latched_and_in_the_fixed_frame(robot):
 def test_without_its_transforms_a_frame_waits_and_is_segmented_all_the_same(robot):
     bench = robot.bench
     image = bench.image(floor_depth(bench.camera))
-    bench.camera_info.publish(bench.info())
-    bench.depth.publish(image)
+    bench.send(image)
     bench.spin(0.4)
     assert not bench.find('planes', image)
     # A later one whose transforms are there does not wait for it.
-    _, header = send(robot, 1.6)
-    assert header.frame_id == 'base_link'
+    assert send(robot, 1.6) == 'base_link'
     assert bench.set_parameters(tf_timeout=0.5)[0].successful
     # Far ahead of tf, and so without it once its time is up.
     ahead = bench.image(floor_depth(bench.camera))
     ahead.header.stamp = later(ahead.header.stamp, 30)
     bench.depth.publish(ahead)
-    message = bench.until(lambda: bench.find('planes', ahead))
-    assert message.header.frame_id == 'base_link'  # static, known at any time
+    # Static, and so known at any time.
+    assert bench.answer('planes', ahead).header.frame_id == 'base_link'
     status = bench.status(lambda s: 'fixed frame odom' in s.message)
-    assert status.level == DiagnosticStatus.WARN
-    assert 'not known that late' in status.message
+    assert status.level == DiagnosticStatus.WARN and 'not known that late' in status.message

@@ -115,6 +115,13 @@ def test_help_names_every_parameter():
     assert all(f'  {field.name} (default' in run.stdout for field in fields(NodeConfig))
 
 
+def assert_ends_well(process):
+    """After an interrupt."""
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=300)
+    assert 'Traceback' not in errors and process.returncode in (0, 130), errors
+
+
 @pytest.mark.parametrize('delay', [0.0, 1.2])
 @pytest.mark.parametrize('command', ['segment_planes', 'rangeseg'])
 def test_interrupted_at_the_start(command, delay, tmp_path):
@@ -130,18 +137,13 @@ def test_interrupted_at_the_start(command, delay, tmp_path):
     )
     with ended(process):
         # Before that Python itself is not ready.
-        assert process.stdout and process.stdout.readline() == 'begun\n'
+        assert process.stdout.readline() == 'begun\n'
         time.sleep(delay)
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=300)
-    assert 'Traceback' not in errors and process.returncode in (0, 130), errors
+        assert_ends_well(process)
 
 
 def test_interrupted_as_it_begins_to_spin():
     process = subprocess.Popen(NODE, stderr=subprocess.PIPE, text=True)
     with ended(process):
-        assert process.stderr
         assert 'will subscribe' in process.stderr.readline()
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=300)
-    assert 'Traceback' not in errors and process.returncode in (0, 130), errors
+        assert_ends_well(process)

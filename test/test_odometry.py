@@ -9,16 +9,12 @@ from planes_of_labels import fit_planes
 from recordings import Recording
 from scipy.spatial.transform import Rotation
 
+from rangeseg_ros import Camera, Config, ConfigError, RangeImage, Transform
 from rangeseg_ros.batch.replay import Replay
-from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.edges import JumpPoints
 from rangeseg_ros.core.mapping.observations import views
 from rangeseg_ros.core.mapping.odometry import _POSES, PlaneOdometry
-from rangeseg_ros.core.mapping.transforms import Transform
-from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.segmenter import Segmenter
-from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.io.recordings import make_rosbags
@@ -36,13 +32,19 @@ STEP = 4
 
 
 def planes_of(scene, k, seed):
-    """Labels and planes of true faces, their numbers as ids."""
+    """What a camera sees of true faces: planes whose ids are their numbers, and their views."""
     view = simulate(scene, Kinect(seed), CAMERA, frame=k, seed=seed)
     image = RangeImage.from_depth(view.depth, CAMERA)
     faces = {plane.label: plane.face for plane in view.planes}
     planes = fit_planes(view.labels, image, SENSOR)
     found = [replace(p, id=faces[p.label] + 1) for p in planes if p.count > 100]
-    return view.labels, found
+    return found, views(view.labels, found, CONFIG.distortion_length)
+
+
+def still(seed):
+    """The same of the first frame of a room."""
+    room = kinect_room(seed)
+    return planes_of(Scene(room.solids, room.poses), 0, seed)
 
 
 def followed(scene, frames, seed=0):
@@ -50,10 +52,8 @@ def followed(scene, frames, seed=0):
     odometry, first = PlaneOdometry(), scene.poses[frames[0]]
     motions, truths = [], []
     for k in frames:
-        labels, planes = planes_of(scene, k, seed)
-        view = views(labels, planes, CONFIG.distortion_length)
         up = first.rotation[2]
-        motions.append(odometry.add(planes, view, 10**9 + k * 10**9 // 30, up))
+        motions.append(odometry.add(*planes_of(scene, k, seed), 10**9 + k * 10**9 // 30, up))
         level = motions[0].pose.rotation @ first.rotation.T
         pose = scene.poses[k]
         truths.append((level @ pose.rotation, level @ (pose.position - first.position)))
@@ -114,15 +114,14 @@ def test_the_ends_of_a_box_tell_the_motion_along_two_walls():
     for with_edges in (False, True):
         odometry = PlaneOdometry()
         for k in range(0, 13, 2):
-            labels, planes = planes_of(scene, k, 5)
-            image = RangeImage.from_depth(
-                simulate(scene, Kinect(0), CAMERA, frame=k).depth, CAMERA
-            )
+            planes, view = planes_of(scene, k, 5)
+            depth = simulate(scene, Kinect(0), CAMERA, frame=k).depth
+            image = RangeImage.from_depth(depth, CAMERA)
             result = Segmenter().segment(image)
             edges = JumpPoints.of(image, result.jumps if with_edges else None, result.cells)
-            held = [plane for plane in planes if abs(plane.normal @ up) < 0.5]
-            view = views(labels, held, CONFIG.distortion_length)
-            motion = odometry.add(held, view, 10**9 + k * 10**9 // 30, up, edges=edges)
+            held = [n for n, plane in enumerate(planes) if abs(plane.normal @ up) < 0.5]
+            shown = [planes[n] for n in held], view[held]
+            motion = odometry.add(*shown, 10**9 + k * 10**9 // 30, up, edges=edges)
         rise, height = motion.pose.shift[2], motion.covariance[2, 2] ** 0.5
         assert abs(rise - 0.12) < 3 * height
         ends.append((abs(rise - 0.12), height))
@@ -192,9 +191,8 @@ def test_jump_points_are_on_the_near_side():
     inverse[:, 50:] = 0  # not measured
     camera = Camera(60, 40, 50.0, 50.0, 29.5, 19.5)
     image = replace(RangeImage.from_depth(1 / np.maximum(inverse, 0.1), camera), inverse=inverse)
-    right = np.abs(np.diff(inverse, axis=1)) > 0.2
-    below = np.abs(np.diff(inverse, axis=0)) > 0.2
-    found = JumpPoints.of(image, (right, below), None)
+    jumps = tuple(np.abs(np.diff(inverse, axis=axis)) > 0.2 for axis in (1, 0))
+    found = JumpPoints.of(image, jumps, None)
     assert len(found.points) == 2 * (20 + 20) - 4
     np.testing.assert_allclose(found.points[:, 2], 1.0)
     rows = found.points[:, 1] * 50 + 19.5
@@ -203,10 +201,7 @@ def test_jump_points_are_on_the_near_side():
 
 
 def test_other_planes_under_known_ids_do_not_make_it_jump():
-    room = kinect_room(1)
-    scene = Scene(room.solids, room.poses)
-    labels, planes = planes_of(scene, 0, 1)
-    view, odometry, pose = views(labels, planes, CONFIG.distortion_length), None, None
+    (planes, view), odometry, pose = still(1), PlaneOdometry(), None
     for k in range(24):
         # All exchange their ids, come under new ones, or are not there.
         ids = [p.id for p in planes]
@@ -214,7 +209,6 @@ def test_other_planes_under_known_ids_do_not_make_it_jump():
             ids = ids[1:] + ids[:1]
         named = [replace(p, id=i + 100 * (k == 12)) for p, i in zip(planes, ids, strict=True)]
         shown = 0 if 16 <= k < 20 else len(named)
-        odometry = odometry or PlaneOdometry()
         motion = odometry.add(named[:shown], view[:shown], 10**9 + k * 10**9 // 30, (0, -1, 0))
         if k == 20:
             assert motion.held == 0
@@ -236,20 +230,16 @@ def test_z_is_up_and_x_forward_whatever_the_camera_sees():
 
 
 def test_stamps_that_do_not_tell_and_gaps_are_no_trouble():
-    scene = Scene(kinect_room(2).solids, kinect_room(2).poses)
-    labels, planes = planes_of(scene, 0, 2)
-    view, odometry = views(labels, planes, CONFIG.distortion_length), PlaneOdometry()
+    seen, odometry = still(2), PlaneOdometry()
     for stamp in (0, 0, 10**9, 10**9, 5 * 10**8, 10**12, 10**18, -5):
-        motion = odometry.add(planes, view, stamp, (0, -1, 0))
+        motion = odometry.add(*seen, stamp, (0, -1, 0))
         assert np.linalg.norm(motion.pose.shift) < 0.01
         assert np.isfinite(motion.covariance).all()
         assert np.linalg.eigvalsh(motion.covariance).min() > -1e-12
 
 
 def test_the_message_has_pose_and_twist_in_their_frames():
-    labels, planes = planes_of(Scene(kinect_room(2).solids, kinect_room(2).poses), 0, 2)
-    view = views(labels, planes, CONFIG.distortion_length)
-    motion = PlaneOdometry().add(planes, view, 10**9, (0, -1, 0))
+    motion = PlaneOdometry().add(*still(2), 10**9, (0, -1, 0))
     stamp = make_rosbags('builtin_interfaces/msg/Time', sec=1, nanosec=2)
     header = make_rosbags('std_msgs/msg/Header', stamp=stamp, frame_id='camera')
     message = odometry_message(make_rosbags, header, motion)
@@ -266,14 +256,12 @@ def test_the_message_has_pose_and_twist_in_their_frames():
 def test_the_map_is_in_the_frame_of_the_odometry_without_tf(tmp_path):
     room, camera = kinect_room(4), Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
     scene = Scene(room.solids, walk(room.poses[0], 4, 20), room.dark)
-    matrix = np.array([130, 0, 79.5, 0, 130, 59.5, 0, 0, 1])
-    recording = Recording()
-    config = Config(odometry=True, min_pixels=60)
+    recording, config = Recording(), Config(odometry=True, min_pixels=60)
     sequence = SequenceSegmenter(config)
     stamps = [10**9 + k * 10**9 // 30 for k in range(0, 20, STEP)]
     for k, stamp in zip(range(0, 20, STEP), stamps, strict=True):
         view = simulate(scene, Kinect(0), camera, frame=k, seed=4)
-        recording.add_camera(stamp, 160, 120, k=matrix)
+        recording.add_camera(stamp, 160, 120, k=camera.matrix.ravel())
         recording.add_image(stamp, view.depth)
         sequence.segment(RangeImage.from_depth(view.depth, camera), stamp)
     recording.write(tmp_path / 'recording')

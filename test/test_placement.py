@@ -7,13 +7,11 @@ import pytest
 from planes_of_labels import fit_planes
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.config import Config
+from rangeseg_ros import Camera, Config, RangeImage
 from rangeseg_ros.core.mapping.map_planes import moved_planes
 from rangeseg_ros.core.mapping.mount import mount_of
 from rangeseg_ros.core.mapping.placement import Placement, Up, UpFilter, find_placement
 from rangeseg_ros.core.mapping.transforms import Transform, TransformError
-from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.io.bag_writer import DepthBagWriter
@@ -28,17 +26,17 @@ MOUNT = Transform((PITCH * Rotation.from_matrix(OPTICAL_IN_BODY)).as_matrix(), n
 UP = (0, -np.cos(np.radians(30)), -np.sin(np.radians(30)))
 
 
-def known(**frames):
+def known(pairs=()):
     def lookup(target, source):
-        if (target, source) not in frames.get('pairs', {}):
+        if (target, source) not in pairs:
             raise TransformError(f'frame {target!r} is not known', may_come=True)
-        return frames['pairs'][target, source]
+        return pairs[target, source]
 
     return lookup
 
 
 def test_up_and_height_come_from_the_gravity_frame():
-    lookup = known(pairs={('base_footprint', 'camera'): MOUNT})
+    lookup = known({('base_footprint', 'camera'): MOUNT})
     found = find_placement(Config(gravity_frame='base_footprint'), 'camera', lookup)
     (up,) = found.ups
     np.testing.assert_allclose(up.direction, UP, atol=1e-12)
@@ -50,7 +48,7 @@ def test_up_and_height_come_from_the_gravity_frame():
 def test_without_it_the_accelerometer_tells_up_and_then_the_parameters():
     config = Config(gravity_frame='base_footprint', fixed_frame='odom')
     turned = Transform(Rotation.from_euler('z', 90, degrees=True).as_matrix(), np.ones(3))
-    lookup = known(pairs={('camera', 'imu'): turned})
+    lookup = known({('camera', 'imu'): turned})
     found = find_placement(config, 'camera', lookup, ('imu', np.array([0, 9.8, 0])))
     np.testing.assert_allclose(found.ups[0].direction, (-1, 0, 0), atol=1e-12)
     # A tenth of gravity across it, even spread: 3.3 degrees.
@@ -65,18 +63,17 @@ def test_without_it_the_accelerometer_tells_up_and_then_the_parameters():
     assert found.sources['up'].startswith('the parameters up_x, up_y, up_z; no imu in elsewhere')
 
 
+def planes_of(camera):
+    inverse = (-CAMERA.rays @ np.array([0.2, -0.3, -0.9])).astype(np.float32)
+    image = RangeImage(CAMERA.rays, inverse, camera)
+    return fit_planes(np.ones(CAMERA.shape, np.uint16), image, SensorModel.from_config(Config()))
+
+
 def test_planes_of_a_camera_elsewhere_are_those_planes_moved():
     """Also their covariance, that of the distance by the lever of the move."""
-    labels = np.ones(CAMERA.shape, np.uint16)
-    inverse = (-CAMERA.rays @ np.array([0.2, -0.3, -0.9])).astype(np.float32)
     there = replace(CAMERA, place=(3.0, -2.0, 0.5))
-    sensor = SensorModel.from_config(Config())
-    here, moved = (
-        fit_planes(labels, RangeImage(camera.rays, inverse, camera), sensor)
-        for camera in (CAMERA, there)
-    )
-    (expected,) = moved_planes(here, Transform(np.eye(3), np.array(there.place)))
-    (plane,) = moved
+    (plane,) = planes_of(there)
+    (expected,) = moved_planes(planes_of(CAMERA), Transform(np.eye(3), np.array(there.place)))
     np.testing.assert_allclose(plane.normal, expected.normal, atol=1e-12)
     assert plane.distance == pytest.approx(expected.distance, abs=1e-9)
     np.testing.assert_allclose(plane.covariance, expected.covariance, rtol=1e-6)
@@ -84,17 +81,12 @@ def test_planes_of_a_camera_elsewhere_are_those_planes_moved():
 
 
 def test_planes_of_another_frame_are_the_same_planes():
-    labels = np.ones(CAMERA.shape, np.uint16)
-    inverse = (-CAMERA.rays @ np.array([0.2, -0.3, -0.9])).astype(np.float32)
-    image = RangeImage(CAMERA.rays, inverse, CAMERA)
-    planes = fit_planes(labels, image, SensorModel.from_config(Config()))
+    planes = planes_of(CAMERA)
     (plane,), (moved,) = planes, moved_planes(planes, MOUNT)
     points = plane.hull @ MOUNT.rotation.T + MOUNT.shift
     np.testing.assert_allclose(moved.hull, points, atol=1e-12)
-    np.testing.assert_allclose(moved.hull @ moved.normal + moved.distance, 0, atol=1e-6)
     np.testing.assert_allclose(moved.hull @ moved.normal, -moved.distance, atol=1e-6)
-    lever = np.append(plane.centroid, 1)
-    there = np.append(moved.centroid, 1)
+    lever, there = (np.append(one.centroid, 1) for one in (plane, moved))
     assert there @ moved.covariance @ there == pytest.approx(lever @ plane.covariance @ lever)
     frame = Rotation.from_quat(moved.orientation).as_matrix()
     np.testing.assert_allclose(frame[:, 2], moved.normal, atol=1e-9)
@@ -122,9 +114,8 @@ def test_the_last_up_is_held_while_a_slope_can_be_told_from_level_ground():
         return filtered.settle(found, round(seconds * 1e9), config)
 
     assert settle(0).lost == 'no terrain, as up is not known: no tf'
-    told = settle(
-        1, Placement(ups=[Up(up, 1.5, 'tf')], asked=True, height=0.8, sources={'up': ''})
-    )
+    by_tf = Placement(ups=[Up(up, 1.5, 'tf')], asked=True, height=0.8, sources={'up': ''})
+    told = settle(1, by_tf)
     assert (told.up_sd, told.height, told.lost) == (1.5, 0.8, '')
     held = settle(3)
     np.testing.assert_allclose(held.up, up, atol=1e-12)
@@ -184,18 +175,14 @@ def test_angles_and_height_are_within_their_errors(height, pitch, roll):
         sequence.segment(image, 10**9 + k * 10**8, pose=Transform.identity())
     mount = mount_of(sequence.map.planes, len(scene.poses), 10.0)
     assert not mount.doubts
-    error = np.array([mount.roll - np.radians(roll), mount.pitch - np.radians(pitch)])
-    assert np.all(np.abs(error) < np.radians(1.0))
-    assert abs(mount.height - height) < 0.02
-    assert np.all(np.abs([*error, mount.height - height]) < 4 * mount.sigma)
+    stated = *np.radians([roll, pitch]), height
+    error = np.abs(np.subtract([mount.roll, mount.pitch, mount.height], stated))
+    assert (error < [np.radians(1), np.radians(1), 0.02]).all() and (error < 4 * mount.sigma).all()
     # The camera's place in the frame on the floor, x forward.
     truth = scene.poses[0].rotation
     np.testing.assert_allclose(mount.rotation, truth, atol=0.03)
-    turned = Rotation.from_euler('xyz', mount.rpy).as_matrix()
-    np.testing.assert_allclose(turned, mount.rotation, atol=1e-9)
-    np.testing.assert_allclose(
-        Rotation.from_quat(mount.quaternion).as_matrix(), mount.rotation, atol=1e-9
-    )
+    for turn in (Rotation.from_euler('xyz', mount.rpy), Rotation.from_quat(mount.quaternion)):
+        np.testing.assert_allclose(turn.as_matrix(), mount.rotation, atol=1e-9)
 
 
 def test_the_command_prints_what_ros_takes_and_says_when_there_is_no_floor(tmp_path, run):
