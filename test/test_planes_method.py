@@ -5,9 +5,8 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.config import Config
+from rangeseg_ros import Camera, Config
 from rangeseg_ros.core.segmenter import Segmenter
-from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage, UnitWarning
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.label_files import as_truth
@@ -26,7 +25,7 @@ def room(seed, noise='measured', width=640, height=480):
     return simulate(kinect_room(seed), Kinect(seed, noise), camera, seed=seed)
 
 
-def compared(seeds, noise, width=640, height=480):
+def compared(seeds, noise, width, height):
     """Overlaps with regions of 1000 pixels of VGA, and how far off normals are, degrees."""
     overlaps, normals = [], []
     for seed in seeds:
@@ -69,18 +68,15 @@ def test_accuracy_on_simulated_rooms(width, height, noise, mean_iou, share):
     assert correct >= share * count
     if noise == 'independent':
         # The targets; the distortion of real sensors turns planes by more.
-        assert np.median(normals) <= 0.1
-        assert np.max(normals) <= 2.0
+        assert np.median(normals) <= 0.1 and np.max(normals) <= 2.0
 
 
 @pytest.mark.parametrize('size', [(424, 240), (212, 120), (101, 67), (37, 61)])
 def test_any_size(size):
     """Also those that blocks do not divide."""
     camera = kinect_camera(*size)
-    inverse = camera.rays @ np.array([0.1, 0.2, 0.5])
-    result = segmented((1 / inverse).astype(np.float32), camera)
-    assert result.labels.shape == camera.shape
-    assert (result.labels == 1).all()
+    result = segmented(1 / (camera.rays @ np.array([0.1, 0.2, 0.5])), camera)
+    assert result.labels.shape == camera.shape and (result.labels == 1).all()
     assert [plane.count for plane in result.planes] == [size[0] * size[1]]
 
 

@@ -55,16 +55,15 @@ def test_planes_that_the_sensor_bends_are_planes(seed):
 @pytest.mark.parametrize('bend', [0.08, 0.2])
 def test_rows_and_columns_are_alike(bend):
     """A tilted and bent surface is as probably a plane where rows and columns are exchanged."""
-    camera = Camera(120, 120, 150.0, 150.0, 59.5, 59.5)
+    camera, whole = Camera(120, 120, 150.0, 150.0, 59.5, 59.5), np.ones((120, 120), np.uint16)
     sensor, rays = SensorModel.from_config(Config(), camera.shape), camera.rays.astype(float)
     inverse = rays @ np.array([0.5, 0.1, 0.5]) + bend * (rays[..., :2] ** 2 @ np.array([1, 0.5]))
-    one, other = (
-        plane_probabilities(
-            Fits.of(np.ones(camera.shape, np.uint16), image, sensor), NO_PAIRS, 0.5
-        )[1]
-        for values in (inverse, inverse.T.copy())
-        for image in [RangeImage(camera.rays, values.astype(np.float32), camera)]
-    )
+
+    def probability(inverse):
+        image = RangeImage(camera.rays, inverse.astype(np.float32), camera)
+        return plane_probabilities(Fits.of(whole, image, sensor), NO_PAIRS, 0.5)[1]
+
+    one, other = probability(inverse), probability(inverse.T)
     assert one == pytest.approx(other, rel=1e-6) and 0.2 < one < 0.9
 
 
@@ -178,12 +177,8 @@ def test_what_a_quadratic_explains_is_what_least_squares_explain():
     random = np.random.default_rng(5)
     u, v, residual = random.uniform(-1, 1, (3, 200))
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
-    flat, whole = (
-        (
-            (terms[:, :count] @ np.linalg.lstsq(terms[:, :count], residual, rcond=None)[0]) ** 2
-        ).sum()
-        for count in (3, 6)
-    )
+    left = [np.linalg.lstsq(terms[:, :count], residual, rcond=None)[1].item() for count in (3, 6)]
+    flat, whole = residual @ residual - left
     found = _explained(np.vstack([terms.T @ terms, terms.T @ residual]))
     np.testing.assert_allclose(found, (flat, whole - flat), rtol=1e-6)
 
@@ -238,7 +233,7 @@ def test_a_crease_stays_in_its_place_where_the_sensor_bends_the_planes():
         inverse = 0.25 + np.abs(column) * 0.25
         inverse = inverse + 0.002 * bent / bent.std() + 0.0012 * noise / noise.std()
         image = RangeImage.from_depth((1 / inverse).astype(np.float32), camera)
-        labels = Segmenter(Config()).segment(image).labels
+        labels = Segmenter().segment(image).labels
         edge = (labels[:, 1:] != labels[:, :-1]) & (np.abs(column[:, 1:]) < 0.1)
         distance = np.abs(np.arange(639) - 319)
         away.append(np.where(edge, distance, 99).min(axis=1))

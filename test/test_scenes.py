@@ -1,6 +1,7 @@
 """Simulated scenes: ray casting, truth regions, random rooms, and what the command writes."""
 
 import csv
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -122,8 +123,7 @@ def test_points_of_a_region_lie_on_its_plane(build, seed):
     frame = simulate(build(seed), Kinect(0, 'none'), camera)
     points = frame.depth[..., None].astype(float) * camera.rays
     for plane in frame.planes:
-        assert plane.distance > 0
-        assert np.linalg.norm(plane.normal) == pytest.approx(1)
+        assert plane.distance > 0 and np.linalg.norm(plane.normal) == pytest.approx(1)
         mask = frame.labels == plane.label
         assert mask.sum() == plane.count
         assert np.abs(points[mask] @ plane.normal + plane.distance).max() < 2e-6
@@ -183,11 +183,21 @@ def test_pose_looks_where_it_says():
 SMALL = ['--width', '160', '--height', '120']
 
 
-def test_kinect_folder_holds_the_scenes(tmp_path, run):
-    output = tmp_path / 'rooms'
+@pytest.fixture
+def simulated(run, tmp_path):
+    """Simulate by the command into a folder."""
+
+    def simulated(*words):
+        code, _, error = run('simulate', *words, *SMALL, '--output', tmp_path / 'rooms')
+        assert code == 0, error
+        return tmp_path / 'rooms'
+
+    return simulated
+
+
+def test_kinect_folder_holds_the_scenes(tmp_path, simulated):
     words = '--scenes', 2, '--frames', 2, '--seed', 7, '--scene', 'curved', '--sensor-seed', 3
-    code, _, error = run('simulate', 'kinect', *words, *SMALL, '--output', output)
-    assert code == 0, error
+    output = simulated('kinect', *words)
     assert [path.name for path in tmp_path.iterdir()] == ['rooms']
     names = ['000007_000000', '000007_000001', '000008_000000', '000008_000001']
     for kind in ('depth', 'truth'):
@@ -211,23 +221,17 @@ def test_kinect_folder_holds_the_scenes(tmp_path, run):
         assert float(row['distance']) == pytest.approx(plane.distance, abs=1e-7)
 
     with DepthBag(output / 'bag') as bag:
-        frames = list(bag)
-    assert len(frames) == 4
-    assert np.array_equal(frames[3].depth, expected.depth)
-    assert frames[3].stamp - frames[0].stamp == 100_000_000
+        first, _, _, last = bag
+    assert np.array_equal(last.depth, expected.depth)
+    assert last.stamp - first.stamp == 100_000_000
 
 
-def test_noise_free_png_is_rounded_and_bag_exact(tmp_path, run):
-    output = tmp_path / 'rooms'
-    code, _, error = run(
-        'simulate', 'kinect', '--scenes', 1, '--noise', 'none', *SMALL, '--output', output
-    )
-    assert code == 0, error
+def test_noise_free_png_is_rounded_and_bag_exact(simulated):
+    output = simulated('kinect', '--scenes', 1, '--noise', 'none')
     depth = cv2.imread(str(output / 'depth' / '000000.png'), cv2.IMREAD_UNCHANGED)
-    assert depth.dtype == np.uint16
     with DepthBag(output / 'bag') as bag:
         (frame,) = bag
-    assert frame.depth.dtype == np.float32
+    assert depth.dtype == np.uint16 and frame.depth.dtype == np.float32
     assert np.abs(1000 * frame.depth - depth).max() <= 0.501
 
 
@@ -236,10 +240,8 @@ def test_nothing_is_overwritten_or_left_half_written(tmp_path, monkeypatch, refu
     (tmp_path / 'rooms/precious').touch()
     assert 'exists already' in refused('simulate', 'kinect', '--output', tmp_path / 'rooms')
 
-    def fail(*_arguments, **_options):
-        raise OSError('disk full')
-
-    monkeypatch.setattr('rangeseg_ros.cli.simulate.write_image', fail)
+    full = mock.Mock(side_effect=OSError('disk full'))
+    monkeypatch.setattr('rangeseg_ros.cli.simulate.write_image', full)
     words = 'simulate', 'kinect', '--scenes', 1, *SMALL, '--output', tmp_path / 'other'
     assert 'disk full' in refused(*words)
     assert [path.name for path in tmp_path.iterdir()] == ['rooms']
@@ -255,11 +257,9 @@ def test_bad_option(tmp_path, option, value, refused):
     assert not any(tmp_path.iterdir())
 
 
-def test_terrain_is_seen_by_an_image_of_any_size(tmp_path, run):
-    output = tmp_path / 'terrain'
+def test_terrain_is_seen_by_an_image_of_any_size(simulated):
     words = '--sensor', 'realsense', '--scenes', 1, '--seed', 5, '--kind', 'curb'
-    code, _, error = run('simulate', 'terrain', *words, *SMALL, '--output', output)
-    assert code == 0, error
+    output = simulated('terrain', *words)
     camera = read_camera(output / 'camera.yaml')
     # 90 degrees wide, as the sensor's own images.
     assert camera == Camera(160, 120, 80.0, 80.0, 79.5, 59.5)

@@ -25,13 +25,10 @@ def perceptron_bytes(values):
 
 
 BLANK = np.zeros((2, 2), np.uint8)
-READERS = (
-    segcomp.read_raster,
-    segcomp.read_segmentation,
-    segcomp.read_perceptron,
-    segcomp.read_angles,
-    segcomp.read_normals,
-)
+READERS = [
+    getattr(segcomp, f'read_{what}')
+    for what in ('raster', 'segmentation', 'perceptron', 'angles', 'normals')
+]
 
 
 @pytest.mark.parametrize('label', range(13))
@@ -49,10 +46,7 @@ def test_normals_and_angles(tmp_path):
     (tmp_path / 'a.ms-nor').write_text('2\n10 0 0.6 -0.8\n12 1 0 0\n')
     (tmp_path / 'a.gt-ang').write_text('2\n10 11 90\n10 14 37.25\n')
     read = segcomp.read_normals(tmp_path / 'a.ms-nor')
-    assert {label: normal.tolist() for label, normal in read.items()} == {
-        1: [0, 0.6, -0.8],
-        3: [1, 0, 0],
-    }
+    assert [(n, *normal) for n, normal in read.items()] == [(1, 0, 0.6, -0.8), (3, 1, 0, 0)]
     assert segcomp.read_angles(tmp_path / 'a.gt-ang') == [(1, 2, 90.0), (1, 5, 37.25)]
 
 

@@ -17,6 +17,7 @@ from rangeseg_ros.core.by_normals.labelling import (
 )
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room
@@ -26,14 +27,13 @@ NORMALS = Config(method='normals')
 # Without noise neither a wide baseline nor much smoothing is called for.
 NOISE_FREE = replace(NORMALS, normal_baseline=1, smoothness=20.0, edge_step=0.0065)
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+CORNER = np.array([(0, -0.8, -0.6), (-0.8, 0.36, -0.48), (0.8, 0.36, -0.48)])
 
 
-def corner(noise=0.0):
+def corner():
     """Depth in metres of a floor and two walls."""
-    rays = CAMERA.rays.astype(float)
-    planes = [((0, -0.8, -0.6), 1.0), ((-0.8, 0.36, -0.48), 1.4), ((0.8, 0.36, -0.48), 1.2)]
-    inverse = np.max([rays @ n / -d for n, d in planes], axis=0)
-    return 1 / inverse + noise * np.random.default_rng(0).normal(size=CAMERA.shape)
+    inverse = (CAMERA.rays.astype(float) @ CORNER.T / (-1.0, -1.4, -1.2)).max(axis=2)
+    return 1 / inverse
 
 
 def segment(depth, config=NORMALS, camera=CAMERA):
@@ -96,9 +96,8 @@ def test_every_option_finds_the_corner(options):
     result = segment(corner(), replace(NORMALS, **options))
     large = [plane for plane in result.planes if plane.count > 300]
     assert len(large) == 3
-    truth = np.array([(0, -0.8, -0.6), (-0.8, 0.36, -0.48), (0.8, 0.36, -0.48)])
-    angles = np.degrees(np.arccos(np.clip(np.array([p.normal for p in large]) @ truth.T, -1, 1)))
-    assert (angles.min(axis=0) < 2).all()
+    cosines = np.array([plane.normal for plane in large]) @ CORNER.T
+    assert (cosines.max(axis=0) > np.cos(np.radians(2))).all()
 
 
 @pytest.mark.parametrize('config', [Config(min_pixels=100), NORMALS], ids=['planes', 'normals'])
@@ -117,18 +116,12 @@ def test_a_result_can_be_pickled_with_its_energy(config):
     assert replace(copy, planes=[]).energy == result.energy
 
 
-def noisy(seed):
-    return corner() + 0.01 * np.random.default_rng(seed).normal(size=CAMERA.shape)
-
-
-def image(seed, camera=CAMERA):
-    return RangeImage.from_depth(noisy(seed), camera)
-
-
 def test_frames_do_not_depend_on_each_other():
     segmenter = Segmenter(NORMALS)
     for seed in (1, 2, 1):
-        assert np.array_equal(segmenter.segment(image(seed)).labels, segment(noisy(seed)).labels)
+        depth = corner() + 0.01 * np.random.default_rng(seed).normal(size=CAMERA.shape)
+        found = segmenter.segment(RangeImage.from_depth(depth, CAMERA))
+        assert np.array_equal(found.labels, segment(depth).labels)
 
 
 def test_a_tilt_is_found_when_asked_for_here_or_in_another_process():
@@ -145,26 +138,6 @@ def test_a_tilt_is_found_when_asked_for_here_or_in_another_process():
 DIRECTIONS = directions(73).astype(np.float32)
 
 
-def patches(seed, height, width, noise):
-    """Normals of rectangles about as large as the smallest plane, noisy, with holes."""
-    random = np.random.default_rng(seed)
-    rows = np.searchsorted((19, 43), np.arange(height), side='right')
-    columns = np.searchsorted((25, 42, 71), np.arange(width), side='right')
-    label = 4 * rows[:, None] + columns
-    truth = DIRECTIONS[random.permutation(len(DIRECTIONS))[:12]][label]
-    normals = truth + noise * random.normal(size=truth.shape)
-    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-    normals[random.random((height, width)) < 0.05] = np.nan
-    return normals.astype(np.float32), label
-
-
-def problem(seed, height=75, width=101, noise=0.15):
-    normals, label = patches(seed, height, width, noise)
-    grid = connected(height, width)
-    grid.right[10:60, 50] = 0
-    return (normals, DIRECTIONS, grid, 40.0), label
-
-
 def connected(height, width):
     return Grid(np.ones((height, width - 1), bool), np.ones((height - 1, width), bool))
 
@@ -172,9 +145,8 @@ def connected(height, width):
 def test_energy_is_close_to_that_of_the_full_expansion():
     """1 % is the package's promise, of rooms."""
     camera = kinect_camera(320, 240)
-    image = RangeImage.from_depth(
-        simulate(kinect_room(5), Kinect(0), camera, seed=5).depth, camera
-    )
+    depth = simulate(kinect_room(5), Kinect(0), camera, seed=5).depth
+    image = RangeImage.from_depth(depth, camera)
     fast, full = (
         Segmenter(Config(method='normals', direction_count=73, exact=exact)).segment(image).energy
         for exact in (False, True)
@@ -183,8 +155,16 @@ def test_energy_is_close_to_that_of_the_full_expansion():
 
 
 def test_noise_free_patches_are_found_to_the_pixel():
-    arguments, label = problem(3, noise=0.0)
-    known = np.isfinite(arguments[0][..., 0])
+    """Rectangles about as large as the smallest plane, with holes."""
+    random = np.random.default_rng(3)
+    rows = np.searchsorted((19, 43), np.arange(75), side='right')
+    columns = np.searchsorted((25, 42, 71), np.arange(101), side='right')
+    label = 4 * rows[:, None] + columns
+    normals = DIRECTIONS[random.permutation(len(DIRECTIONS))[:12]][label]
+    normals[random.random(label.shape) < 0.05] = np.nan
+    arguments = normals, DIRECTIONS, connected(*label.shape), 40.0
+    arguments[2].right[10:60, 50] = 0
+    known = np.isfinite(normals[..., 0])
     found = minimise(*arguments)
     assert len(np.unique(np.stack([found[known], label[known]]), axis=1).T) == 12
     np.testing.assert_array_equal(found[known], minimise_exactly(*arguments)[known])
@@ -274,10 +254,7 @@ def test_edges_lie_on_both_sides_of_jumps():
 def test_segment_writes_normals_as_red_green_blue(tmp_path, room, run):
     path = tmp_path / 'a.tiff'
     cv2.imwrite(str(path), room.depth)
-    (tmp_path / 'camera.yaml').write_text(
-        'image_width: 160\nimage_height: 120\ncamera_matrix: {rows: 3, cols: 3, data: '
-        f'[{KINECT.fx}, 0, {KINECT.cx}, 0, {KINECT.fy}, {KINECT.cy}, 0, 0, 1]}}\n'
-    )
+    write_camera(tmp_path / 'camera.yaml', KINECT)
     segment = 'segment', path, '--camera', tmp_path / 'camera.yaml', '--output'
     assert run(*segment, tmp_path, '--normals')[0] == run(*segment, tmp_path / 'plain')[0] == 0
     assert not (tmp_path / 'plain/a_normals.tiff').exists()
@@ -289,11 +266,12 @@ def test_segment_writes_normals_as_red_green_blue(tmp_path, room, run):
 
 def test_messages_hold_normals_and_edges(room):
     image, result = segmented(room)
-    made = {}
-    for name in ('normals', 'edges'):
-        made[name] = OUTPUTS[name].message(lambda kind, **fields: fields, None, image, result)
-    assert made['normals']['encoding'] == '32FC3' and made['normals']['step'] == 160 * 12
-    sent = made['normals']['data'].view('<f4').reshape(120, 160, 3)
+    normals, edges = (
+        OUTPUTS[name].message(lambda kind, **fields: fields, None, image, result)
+        for name in ('normals', 'edges')
+    )
+    assert normals['encoding'] == '32FC3' and normals['step'] == 160 * 12
+    sent = normals['data'].view('<f4').reshape(120, 160, 3)
     np.testing.assert_array_equal(sent, result.normals)
-    assert made['edges']['encoding'] == 'mono8'
-    np.testing.assert_array_equal(made['edges']['data'].reshape(120, 160) == 255, result.edges)
+    assert edges['encoding'] == 'mono8'
+    np.testing.assert_array_equal(edges['data'].reshape(120, 160) == 255, result.edges)
