@@ -44,28 +44,24 @@ def test_texts_are_short(seen, result):
     assert 'nothing' in repr(RangeImage.from_depth(np.zeros((480, 640)), seen.camera))
 
 
-def test_dictionaries_are_json_and_hold_the_numbers(result):
+def test_dictionaries_and_tables_hold_the_numbers(result):
     told = json.loads(json.dumps(result.to_dict()))
     assert told['shape'] == list(result.labels.shape)
     for plane, known in zip(result.planes, told['planes'], strict=True):
         assert np.array_equal(plane.normal, known['normal'])
         assert np.array_equal(plane.hull, known['hull'])
         assert (plane.id, plane.role, plane.count) == (known['id'], known['role'], known['count'])
-
-
-def test_html_has_a_picture_and_a_row_for_each_plane(result):
-    page = result._repr_html_()
-    assert 'data:image/png;base64,' in page
-    assert page.count('<tr>') == len(result.planes) + 1
-
-
-def test_pandas(result):
     table = result.to_pandas()
     assert table['count'].tolist() == [plane.count for plane in result.planes]
     assert table['normal_z'].tolist() == [plane.normal[2] for plane in result.planes]
 
 
-def test_trimesh(result):
+def test_pictures(result):
+    page = result._repr_html_()
+    assert 'data:image/png;base64,' in page and page.count('<tr>') == len(result.planes) + 1
+    matplotlib.use('agg')
+    (shown,) = result.plot().images
+    assert shown.get_array().shape == (480, 640, 3)
     scene = result.to_trimesh()
     for plane in result.planes:
         mesh = scene.geometry[f'plane {plane.id}']
@@ -77,12 +73,6 @@ def test_open3d(result):
     pytest.importorskip('open3d', exc_type=ImportError)
     for plane, mesh in zip(result.planes, result.to_open3d(), strict=True):
         assert np.allclose(np.asarray(mesh.vertices), plane.mesh()[0])
-
-
-def test_plot(result):
-    matplotlib.use('agg')
-    (shown,) = result.plot().images
-    assert shown.get_array().shape == (480, 640, 3)
 
 
 def test_errors_are_value_errors_with_a_suggestion(seen):

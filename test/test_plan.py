@@ -16,10 +16,9 @@ from recordings import Recording
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
+from rangeseg_ros import Camera, Transform
 from rangeseg_ros.cli.main import rangeseg
 from rangeseg_ros.core.ground.stairs import Stairs
-from rangeseg_ros.core.mapping.transforms import Transform
-from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.io.plans import write_dxf, write_geojson
 from rangeseg_ros.plan.flights import Flight, flights
 from rangeseg_ros.plan.floor_plan import FloorPlan, Up, estimate_up

@@ -1,5 +1,6 @@
 """The pages of replay and evaluate, what a browser makes of them, and pictures."""
 
+import os
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -143,8 +144,7 @@ def test_an_overview_leads_to_the_reports_of_several_recordings(tmp_path, monkey
     for name in names:
         record_walls(tmp_path / name, 16)
     file = next((tmp_path / names[1]).glob('*.mcap'))
-    with file.open('r+b') as stream:
-        stream.truncate(file.stat().st_size - 100)
+    os.truncate(file, file.stat().st_size - 100)
     pages = []
     for _ in range(2):  # the second time, all is found done
         assert run('replay', *names, '--output', 'out', '--jobs', 1)[0] == 1

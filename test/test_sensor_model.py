@@ -5,15 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rangeseg_ros import Segmenter
-from rangeseg_ros.core.config import Config
+from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.fitting.error_law import Law, Strata, fit_law
 from rangeseg_ros.core.fitting.noise import ROUGH, _random, measured_sensor, quantisation
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.sensing.blocks import Blocks
-from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.moments import COUNT, SIZE
-from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import (
     SensorModel,
     correlated_residuals,
@@ -34,21 +31,17 @@ def three_planes():
     return inverse
 
 
-def sensor_of(inverse, prior=STATED, camera=CAMERA):
-    image = RangeImage(CAMERA.rays, inverse.astype(np.float32), camera)
-    return measured_sensor(image, Blocks.of(image), prior, quantisation(image.inverse))
+def sensor_of(inverse):
+    image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
+    return measured_sensor(image, Blocks.of(image), STATED, quantisation(image.inverse))
 
 
 def test_variance_is_the_sum_of_both_kinds():
-    sensor = STATED._replace(noise=0.003, range_noise=0.001, distortion=0.002)
-    squared = np.array([0.2, 1.0, 3.0]) ** 2
-    np.testing.assert_allclose(
-        random_variance(sensor, squared), 9e-6 + 1e-6 * squared**2, rtol=1e-5
-    )
-    sensor = sensor._replace(range_distortion=0.005)
-    np.testing.assert_allclose(
-        systematic_variance(sensor, squared), 4e-6 + 25e-6 * squared**2, rtol=1e-5
-    )
+    known = {'noise': 0.003, 'range_noise': 0.001, 'distortion': 0.002, 'range_distortion': 0.005}
+    sensor, squared = STATED._replace(**known), np.array([0.2, 1.0, 3.0]) ** 2
+    random, systematic = 9e-6 + 1e-6 * squared**2, 4e-6 + 25e-6 * squared**2
+    np.testing.assert_allclose(random_variance(sensor, squared), random, rtol=1e-5)
+    np.testing.assert_allclose(systematic_variance(sensor, squared), systematic, rtol=1e-5)
 
 
 @pytest.mark.parametrize('noise', [0.0002, 0.003])
@@ -59,21 +52,18 @@ def test_white_noise_is_measured_up_and_down(noise, holes):
     inverse = three_planes() + random.normal(0, noise, CAMERA.shape)
     inverse[random.random(CAMERA.shape) < holes] = 0
     sensor = sensor_of(inverse)
-    assert sensor.noise == pytest.approx(noise, rel=0.15)
-    assert sensor.range_noise == 0
-    assert sensor.white > 0.7
-    assert sensor.distortion < 0.6 * noise
+    assert sensor.noise == pytest.approx(noise, rel=0.15) and sensor.range_noise == 0
+    assert sensor.white > 0.7 and sensor.distortion < 0.6 * noise
 
 
 def test_the_standard_error_of_the_noise_is_what_it_scatters_by():
     found = []
     for seed in range(12):
         inverse = three_planes() + np.random.default_rng(seed).normal(0, 0.003, CAMERA.shape)
-        found.append(sensor_of(inverse))
-    off = np.mean([sensor.noise / 0.003 - 1 for sensor in found])
-    scatter = np.std([sensor.noise / 0.003 for sensor in found])
-    told = np.mean([sensor.noise_error for sensor in found])
-    assert scatter / 2 < told < 3 * scatter and abs(off) < 2 * told
+        sensor = sensor_of(inverse)
+        found.append((sensor.noise / 0.003, sensor.noise_error))
+    (mean, told), (scatter, _) = np.mean(found, axis=0), np.std(found, axis=0)
+    assert scatter / 2 < told < 3 * scatter and abs(mean - 1) < 2 * told
 
 
 def test_noise_of_the_range_is_told_from_that_of_its_inverse():
@@ -201,8 +191,7 @@ def test_the_stronger_planes_bend_the_more_distortion_is_measured(bend):
 @pytest.mark.parametrize('seed', range(3))
 def test_what_noise_hides_is_not_made_more_of(seed):
     """Creases that blocks show by less than the noise: no field is told that would show more."""
-    columns = 0.004 * np.abs(np.arange(640) / 60 % 2 - 1)
-    rows = 0.004 * np.abs(np.arange(480) / 60 % 2 - 1)
+    rows, columns = (0.004 * np.abs(np.arange(n) / 60 % 2 - 1) for n in CAMERA.shape)
     creases = columns + rows[:, None]
     depth = 2 + np.arange(480)[:, None] / 960 + creases
     noise = np.random.default_rng(seed).normal(0, 0.02, CAMERA.shape)
@@ -216,8 +205,7 @@ def test_depth_rounded_to_steps_tells_the_step(step):
     inverse = three_planes()
     with np.errstate(divide='ignore'):
         sensor = sensor_of(1 / (step * np.rint(1 / inverse / step)))
-    assert sensor.range_quantum == pytest.approx(step, rel=0.01)
-    assert sensor.quantum == 0
+    assert sensor.range_quantum == pytest.approx(step, rel=0.01) and sensor.quantum == 0
     assert sensor.range_noise >= 0.99 * step / np.sqrt(12)
 
 
@@ -225,8 +213,7 @@ def test_disparity_rounded_to_steps_tells_the_step():
     random = np.random.default_rng(6)
     inverse = three_planes() + 0.001 * smooth_field(CAMERA.shape, (2.0, 2.0), random)
     sensor = sensor_of(0.0029 * np.rint(inverse / 0.0029))
-    assert sensor.quantum == pytest.approx(0.0029, rel=0.01)
-    assert sensor.range_quantum == 0
+    assert sensor.quantum == pytest.approx(0.0029, rel=0.01) and sensor.range_quantum == 0
 
 
 def test_an_image_that_says_too_little_leaves_what_is_known():
@@ -246,11 +233,10 @@ def test_whatever_the_image_the_model_is_finite(seed, holes, scale):
     image = RangeImage(camera.rays, inverse.astype(np.float32), camera)
     blocks = Blocks.of(image)
     sensor = measured_sensor(image, blocks, STATED, (0.0, 0.0))
-    assert np.isfinite(sensor).all() and min(sensor) >= 0
-    assert sensor.white <= 1
+    assert np.isfinite(sensor).all() and min(sensor) >= 0 and sensor.white <= 1
     steps = jump_steps(blocks, sensor)
-    assert np.isfinite(steps).all() and (steps.windows > 0).all()
-    assert (steps.windows <= steps.pixels).all()
+    assert np.isfinite(steps).all()
+    assert ((steps.windows > 0) & (steps.windows <= steps.pixels)).all()
 
 
 def test_steps_are_those_of_the_flat_blocks_around():
@@ -281,10 +267,7 @@ def test_steps_are_those_of_the_flat_blocks_around():
 @pytest.mark.parametrize('width', [0.7, 2.0, 4.0])
 def test_what_blocks_leave_of_correlated_noise(width):
     """Against fits to simulated fields."""
-    random = np.random.default_rng(8)
-    field = smooth_field((256, 256), (width, width), random)
-    rows, columns = np.indices((16, 16)).reshape(2, -1)
-    left = {}
+    field, left = smooth_field((256, 256), (width, width), np.random.default_rng(8)), {}
     for side in (4, 8, 16):
         parts = field.reshape(256 // side, side, -1, side).transpose(0, 2, 1, 3)
         parts = parts.reshape(-1, side * side)
@@ -311,8 +294,8 @@ def test_white_and_correlated_noise_are_told_from_blocks_of_several_sizes(white,
 @pytest.mark.parametrize(('white', 'width'), [(1.0, 2.0), (0.33, 2.0), (0.0, 0.7), (0.5, 0.0)])
 def test_a_patch_is_what_the_mean_of_four_pixels_keeps_of_the_noise(white, width):
     sensor = STATED._replace(white=white, correlation=width)
-    rows, columns = np.indices((2, 2)).reshape(2, 4)
-    squared = (rows[:, None] - rows) ** 2 + (columns[:, None] - columns) ** 2
+    places = np.argwhere(np.ones((2, 2)))
+    squared = ((places[:, None] - places) ** 2).sum(axis=2)
     field = np.exp(-squared / (4 * width**2)) if width else np.eye(4)
     covariance = white * np.eye(4) + (1 - white) * field
     assert sensor.patch == pytest.approx(4 * covariance.mean(), rel=1e-9)

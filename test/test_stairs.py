@@ -45,23 +45,21 @@ def up_of(up):
     return dict(zip(('up_x', 'up_y', 'up_z'), map(float, up), strict=True))
 
 
-@pytest.mark.parametrize('direction', ['up', 'down'])
-def test_edge_count_rise_and_run(direction, tmp_path):
-    sides = (-0.5, 0.6)
-    if direction == 'up':
-        pieces = (Piece(FLOOR, GROUND), *treads(1.9, 3, 0.17, 0.28, OBSTACLE, sides))
-    else:
-        floor = Piece(slab(-3, 1.3, 0, 0, ALL), GROUND)
-        pieces = (floor, *treads(1.3, 4, 0.16, 0.3, DROP, sides))
+@pytest.mark.parametrize(
+    ('direction', 'begin', 'count', 'rise', 'run'),
+    [('up', 1.9, 3, 0.17, 0.28), ('down', 1.3, 4, 0.16, 0.3)],
+)
+def test_edge_count_rise_and_run(direction, begin, count, rise, run, tmp_path):
+    sides, class_ = (-0.5, 0.6), OBSTACLE if direction == 'up' else DROP
+    floor = FLOOR if direction == 'up' else slab(-3, begin, 0, 0, ALL)
+    pieces = Piece(floor, GROUND), *treads(begin, count, rise, run, class_, sides)
     terrain, image, result = seen(*pieces, yaw=10)
     (stairs,) = result.stairs
-    assert stairs.direction == direction
-    assert stairs.count == (3 if direction == 'up' else 4)
-    assert stairs.rise == approx(0.17 if direction == 'up' else 0.16, abs=0.01)
-    assert stairs.run == approx(0.28 if direction == 'up' else 0.3, abs=0.025)
+    assert (stairs.direction, stairs.count) == (direction, count)
+    assert stairs.rise == approx(rise, abs=0.01) and stairs.run == approx(run, abs=0.025)
     assert stairs.width == approx(1.1, abs=0.1)
     edge = stairs.edge @ terrain.pose.rotation.T + terrain.pose.position
-    assert edge[:, 0] == approx(1.9 if direction == 'up' else 1.3, abs=0.06)
+    assert edge[:, 0] == approx(begin, abs=0.06)
     assert np.sort(edge[:, 1]) == approx(sides, abs=0.08)
     assert np.abs(edge[:, 2]).max() < 0.03
     # It is written as the contract says, and survives another process.
@@ -88,7 +86,7 @@ def test_the_edge_is_in_the_frame_of_a_cloud():
     np.testing.assert_array_equal(again.edge, stairs.edge)
 
 
-def test_boxes_side_by_side_a_table_and_one_step_are_no_stairs():
+def test_boxes_side_by_side_and_one_step_are_no_stairs():
     boxes = [
         Piece(box((0.3, 0.3, h), np.eye(3), (1.6 + 0.1 * k, 0.4 * k - 0.4, h / 2)), OBSTACLE, h)
         for k, h in enumerate((0.15, 0.3, 0.45))
@@ -113,8 +111,7 @@ def test_a_tilted_camera_is_noticed_and_said(axis, segment_image):
     frame = simulate_terrain(terrain, Kinect(), CAMERA)
     config = Config(**up_of(wrong))
     tilt = Segmenter(config).segment(RangeImage.from_depth(frame.depth, CAMERA)).tilt
-    apart = np.degrees(np.arccos(wrong @ terrain.up))
-    assert tilt is not None and tilt.degrees == approx(apart, abs=2)
+    assert tilt.degrees == approx(np.degrees(np.arccos(wrong @ terrain.up)), abs=2)
     assert tilt.up == approx(terrain.up, abs=0.03)
     code, _, error = segment_image(frame.depth, CAMERA, **up_of(wrong))
     assert code == 0 and 'the stated up is off by' in error
