@@ -39,16 +39,9 @@ class Recording:
         return types['std_msgs/msg/Header'](stamp=time, frame_id=frame_id, **fields)
 
     def add_image(self, stamp, image, encoding='16UC1', topic='/camera/depth/image_rect'):
-        step = image.strides[0]
-        message = self.store.types[IMAGE](
-            header=self.header(stamp),
-            height=image.shape[0],
-            width=image.shape[1],
-            encoding=encoding,
-            is_bigendian=0,
-            step=step,
-            data=np.ascontiguousarray(image).view(np.uint8).ravel(),
-        )
+        data = np.ascontiguousarray(image).view(np.uint8).ravel()
+        layout = *image.shape[:2], encoding, 0, image.strides[0]
+        message = self.store.types[IMAGE](self.header(stamp), *layout, data)
         self.messages.append((stamp, topic, IMAGE, message))
 
     def add_compressed(self, stamp, image, topic='/camera/depth/image_rect/compressedDepth'):
@@ -71,13 +64,8 @@ class Recording:
         **changes,
     ):
         k = changes.get('k', np.array([focal, 0, 31.5, 0, focal, 23.5, 0, 0, 1]))
-        matrices = {
-            'd': np.zeros(5),
-            'k': k,
-            'r': np.eye(3).ravel(),
-            'p': np.insert(k, (3, 6, 9), 0.0),
-            **changes,
-        }
+        matrices = {'d': np.zeros(5), 'k': k, 'r': np.eye(3).ravel()}
+        matrices |= {'p': np.insert(k, (3, 6, 9), 0.0), **changes}
         if self.ros1:
             matrices = {name.upper(): matrix for name, matrix in matrices.items()}
         message = self.store.types[CAMERA_INFO](
@@ -117,10 +105,7 @@ class Recording:
             if compression:
                 writer.set_compression(writer.CompressionFormat[compression])
         else:
-            plugin = {
-                'mcap': rosbag2.StoragePlugin.MCAP,
-                'sqlite3': rosbag2.StoragePlugin.SQLITE3,
-            }[storage]
+            plugin = rosbag2.StoragePlugin[storage.upper()]
             writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
             serialize = self.store.serialize_cdr
             if compression:

@@ -10,6 +10,7 @@ from array import array
 from contextlib import contextmanager
 
 import numpy as np
+import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from message_classes import cdr
@@ -65,6 +66,22 @@ def ended(process):
     finally:
         process.kill()
         process.wait()
+
+
+def benches(*outputs, **parameters):
+    """Fixtures: the node of a module, and it with a listener for outputs and a reliable camera."""
+
+    @pytest.fixture(scope='module')
+    def node():
+        with Bench(**parameters) as bench:
+            yield bench
+
+    @pytest.fixture
+    def bench(node):
+        with node.listening(*outputs), node.camera_on():
+            yield node
+
+    return node, bench
 
 
 class Bench:

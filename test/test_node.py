@@ -16,7 +16,7 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.qos import ReliabilityPolicy
-from ros_bench import BEST_EFFORT, DEPTH, INFO, Bench, corner_depth, ended, values_of
+from ros_bench import BEST_EFFORT, DEPTH, INFO, Bench, benches, corner_depth, ended, values_of
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
 
 from rangeseg_ros import Config, RangeImage, Segmenter
@@ -26,17 +26,7 @@ pytestmark = pytest.mark.ros
 REPOSITORY = Path(__file__).parents[1]
 
 
-@pytest.fixture(scope='module')
-def node():
-    with Bench() as bench:
-        yield bench
-
-
-@pytest.fixture
-def bench(node):
-    """The node with a listener for its labels and a reliable camera."""
-    with node.listening('labels'), node.camera_on():
-        yield node
+node, bench = benches('labels')
 
 
 @pytest.fixture(scope='module')
@@ -47,14 +37,6 @@ def expected(node):
     # Two walls: were the core to find none, the tests below would say little.
     assert len(set(labels.ravel()) - {0}) == 2
     return labels
-
-
-def test_labels_are_those_of_the_core_under_the_header_of_the_image(bench, expected):
-    image = bench.image()
-    np.testing.assert_array_equal(bench.segment(image), expected)
-    message = bench.find('labels', image)
-    assert message.header == image.header
-    assert (message.encoding, message.is_bigendian, message.step) == ('mono16', 0, 320)
 
 
 def test_nothing_is_subscribed_while_nobody_listens(node):

@@ -9,7 +9,7 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from recordings import Recording
-from ros_bench import DEPTH, FRAME, Bench, assert_replayed
+from ros_bench import DEPTH, FRAME, Bench, assert_replayed, benches
 from sensor_msgs.msg import Imu
 
 from rangeseg_ros import ROLES, Camera, Config, planes_from_message
@@ -24,17 +24,7 @@ HEIGHT, WALL = 0.8, 3.0
 GRAVITY = 9.81
 
 
-@pytest.fixture(scope='module')
-def node():
-    with Bench() as bench:
-        yield bench
-
-
-@pytest.fixture
-def bench(node):
-    """The node with a listener for labels and planes and a reliable camera."""
-    with node.listening('labels', 'planes'), node.camera_on():
-        yield node
+node, bench = benches('labels', 'planes')
 
 
 def room(camera, wall=WALL):

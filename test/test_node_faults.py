@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from ros_bench import DEPTH, INFO, Bench, corner_depth, values_of
+from ros_bench import DEPTH, INFO, benches, corner_depth, values_of
 from sensor_msgs.msg import PointCloud2
 
 from rangeseg_ros import planes_from_message
@@ -20,17 +20,7 @@ from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 pytestmark = pytest.mark.ros
 
 
-@pytest.fixture(scope='module')
-def node():
-    with Bench(stall_timeout=3.0) as bench:
-        yield bench
-
-
-@pytest.fixture
-def bench(node):
-    """The node with a listener for its labels and a reliable camera."""
-    with node.listening('labels'), node.camera_on():
-        yield node
+node, bench = benches('labels', stall_timeout=3.0)
 
 
 def assert_segments(bench):

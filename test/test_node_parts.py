@@ -65,10 +65,7 @@ def test_turns_are_in_order_whoever_is_ready_first():
     for thread in threads:
         thread.join(60)
     assert had == places
-
-
-def test_a_turn_that_fails_is_over():
-    order = TicketLock()
+    # A turn that fails is over.
     first, second = order.take_ticket(), order.take_ticket()
     with pytest.raises(ValueError), order.turn(first):
         raise ValueError

@@ -183,11 +183,10 @@ def frames(tmp_path):
     """Arguments for two frames of 96x72, and the folder that holds them."""
     camera = kinect_camera(96, 72)
     write_camera(tmp_path / 'camera.yaml', camera)
-    paths = []
-    for seed in range(2):
-        paths.append(tmp_path / f'{seed}.png')
-        write_image(paths[-1], simulate(kinect_room(seed), Kinect(0), camera, seed=seed).depth)
-    return [*map(str, paths), '--camera', str(tmp_path / 'camera.yaml')]
+    paths = tmp_path / '0.png', tmp_path / '1.png'
+    for seed, path in enumerate(paths):
+        write_image(path, simulate(kinect_room(seed), Kinect(0), camera, seed=seed).depth)
+    return *paths, '--camera', tmp_path / 'camera.yaml'
 
 
 @pytest.mark.slow

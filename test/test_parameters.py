@@ -140,25 +140,25 @@ def test_every_parameter_file_undoes_any_other():
         assert found == names['segment_planes.yaml'], name
 
 
-class Compilation:
+@pytest.fixture
+def compilation(monkeypatch):
     """Takes the place of the compiler: of more than the first outputs once it is released."""
 
-    def __init__(self, monkeypatch):
-        self.came, self.release = [], Event()
-        monkeypatch.setattr(settings, 'prepare', self.prepare)
-
-    def prepare(self, config, kinds, report, outputs):
+    def prepare(config, kinds, report, outputs):
         if outputs != FIRST:
-            self.release.wait()
-        self.came.append(outputs)
+            known.release.wait()
+        known.came.append(outputs)
+
+    known = SimpleNamespace(came=[], release=Event())
+    monkeypatch.setattr(settings, 'prepare', prepare)
+    return known
 
 
 def settings_of(config=NodeConfig(), changed=lambda: None):  # noqa: B008
     return Settings(config, lambda progress: None, changed)
 
 
-def test_the_first_frames_wait_for_labels_and_other_outputs_for_their_kernels(monkeypatch):
-    compilation = Compilation(monkeypatch)
+def test_the_first_frames_wait_for_labels_and_other_outputs_for_their_kernels(compilation):
     came = compilation.came
 
     def publish():
@@ -178,8 +178,8 @@ def test_the_first_frames_wait_for_labels_and_other_outputs_for_their_kernels(mo
     assert set(came[2]) > set(FIRST) and came[3] is True
 
 
-def test_what_needs_no_other_kernels_is_in_use_at_once(monkeypatch):
-    compilation, used = Compilation(monkeypatch), settings_of()
+def test_what_needs_no_other_kernels_is_in_use_at_once(compilation):
+    used = settings_of()
     first = used.in_use()
     other, normals = NodeConfig(min_pixels=500), NodeConfig(method='normals')
     used.want(other)
@@ -227,8 +227,8 @@ def test_whoever_waits_is_let_go_at_the_end(monkeypatch):
     release.set()
 
 
-def test_what_a_robot_stops_for_comes_first_once_its_kernels_are_there(monkeypatch):
-    compilation, used = Compilation(monkeypatch), settings_of()
+def test_what_a_robot_stops_for_comes_first_once_its_kernels_are_there(compilation):
+    used = settings_of()
     assert used.in_use()
     names = ['labels', 'normals', 'drops']
     assert used.ready_first(names) == names
@@ -249,17 +249,16 @@ def test_events_wait_while_messages_come(context):
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
 
+    def spin_until(condition):
+        while not condition():
+            executor.spin_once(timeout_sec=0.01)
+
     def listen():
         other.create_subscription(Empty, 'topic', lambda message: None, 5)
-        while not publisher.get_subscription_count():
-            executor.spin_once(timeout_sec=0.01)
-
-    def spin_until_it_came():
-        while not came:
-            executor.spin_once(timeout_sec=0.01)
+        spin_until(publisher.get_subscription_count)
 
     listen()
-    spin_until_it_came()
+    spin_until(lambda: came)
     group.message_came()
     assert group.can_execute(publisher.event_handlers[0])  # the first has nothing before it
     group.message_came()
@@ -269,7 +268,7 @@ def test_events_wait_while_messages_come(context):
         executor.spin_once(timeout_sec=0.01)
     assert not came
     group.look()
-    spin_until_it_came()
+    spin_until(lambda: came)
 
 
 def test_the_interval_is_kept(monkeypatch):

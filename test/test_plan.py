@@ -48,7 +48,6 @@ def room():
 def record(path, tilt):
     """A robot that turns before the door, with the tf of a frame turned by `tilt`."""
     recording, random = Recording(), np.random.default_rng(3)
-    matrix = np.array([CAMERA.fx, 0, CAMERA.cx, 0, CAMERA.fy, CAMERA.cy, 0, 0, 1])
     for k in range(FRAMES):
         stamp = 10**18 + k * 100_000_000
         body = Rotation.from_euler('zy', [30 - 70 * k / (FRAMES - 1), 15], degrees=True)
@@ -59,7 +58,7 @@ def record(path, tilt):
         depth = depth.reshape(CAMERA.shape)
         inverse = 1 / depth + random.normal(0, 5e-4, depth.shape)
         depth = np.where(inverse > 1 / 6, 1 / np.maximum(inverse, 1 / 6), 0)
-        recording.add_camera(stamp, CAMERA.width, CAMERA.height, k=matrix)
+        recording.add_camera(stamp, CAMERA.width, CAMERA.height, k=CAMERA.matrix.ravel())
         recording.add_image(stamp, np.round(1000 * depth).astype(np.uint16))
         told, at = tilt * turn, tilt.apply(place)
         for after in (-20_000_000, 20_000_000):
@@ -91,24 +90,23 @@ def of_role(folder, role, name='plan.geojson'):
     return [f for f in collection['features'] if f['properties']['role'] == role]
 
 
+def shape_of(feature):
+    return shapely.from_geojson(json.dumps(feature['geometry']))
+
+
 @pytest.mark.parametrize('name', ['level', 'tilted'])
 def test_the_plan_is_that_of_the_room(folders, name):
     folder = folders / name
     (floor,) = of_role(folder, 'floor')
-    assert shapely.from_geojson(json.dumps(floor['geometry'])).is_valid
-    height = floor['properties']['distance']
-    assert floor['properties']['exact'] == 'level'
-    if name == 'level':
-        assert height == pytest.approx(0, abs=0.01)
+    assert shape_of(floor).is_valid and floor['properties']['exact'] == 'level'
     walls = of_role(folder, 'wall')
     assert len(walls) >= 2 and all(wall['properties']['exact'] == 'square' for wall in walls)
-    lines = [shapely.from_geojson(json.dumps(wall['geometry'])) for wall in walls]
-    ahead = max(lines, key=lambda line: len(shapely.get_parts(line)))
+    ahead = max(map(shape_of, walls), key=lambda line: len(shapely.get_parts(line)))
     (opening,) = of_role(folder, 'opening')
     assert opening['properties']['width'] == pytest.approx(DOOR[1] - DOOR[0], abs=0.1)
-    gap = shapely.from_geojson(json.dumps(opening['geometry']))
-    assert gap.distance(ahead) < 0.01
+    assert shape_of(opening).distance(ahead) < 0.01
     if name == 'level':
+        assert floor['properties']['distance'] == pytest.approx(0, abs=0.01)
         (x1, y1), (x2, y2) = opening['geometry']['coordinates']
         assert [x1, x2] == pytest.approx([AHEAD, AHEAD], abs=0.02)
         assert sorted([y1, y2]) == pytest.approx(DOOR, abs=0.06)
@@ -122,12 +120,11 @@ def test_up_that_nobody_states_is_found(folders):
     assert np.allclose(matrix[:3, :3] @ found, [0, 0, 1], atol=1e-5)
 
 
-def test_nav2_reads_the_map(folders):
-    folder = folders / 'level'
-    about = yaml.safe_load((folder / 'map.yaml').read_text())
-    shades = cv2.imread(str(folder / about['image']), cv2.IMREAD_UNCHANGED)
+def test_nav2_reads_the_map_and_the_picture_shows_its_cells(folders):
+    about = yaml.safe_load((folders / 'level/map.yaml').read_text())
+    shades = cv2.imread(str(folders / 'level' / about['image']), cv2.IMREAD_UNCHANGED)[::-1]
     # As map_server does it.
-    share = (255 - shades[::-1].astype(float)) / 255
+    share = (255 - shades.astype(float)) / 255
     occupied, free = share > about['occupied_thresh'], share < about['free_thresh']
     assert set(np.unique(shades)) == {0, 205, 254}
 
@@ -138,11 +135,6 @@ def test_nav2_reads_the_map(folders):
     assert at(AHEAD, 0.1) == at(AHEAD, -1.8) == at(2.0, 0.5) == 'occupied'
     assert at(2.0, -0.8) == at(AHEAD, -0.85) == at(AHEAD + 0.4, -0.9) == 'free'
     assert at(AHEAD + 1, 0.3) == 'unknown'
-
-
-def test_the_picture_shows_the_cells_of_the_map(folders):
-    about = yaml.safe_load((folders / 'level/map.yaml').read_text())
-    shades = cv2.imread(str(folders / 'level' / about['image']), cv2.IMREAD_UNCHANGED)[::-1]
     picture, side = ET.parse(folders / 'level/plan.svg').getroot(), about['resolution']
     legend = [text.text for text in picture.iterfind('.//{*}g[@id="legend"]/{*}text')]
     assert legend[1:] == ['to 2 mm', 'to 5 mm', 'to 10 mm', 'to 20 mm', 'more']
@@ -168,11 +160,9 @@ def test_other_programs_open_the_files(folders):
     parts = sum(len(part) for plane in planes for part in plane['parts'])
     assert len(document.modelspace().query('POLYLINE[layer=="PLANES"]')) == parts
     area = sum(plane['area'] for plane in planes)
-    for name in ('map.ply', 'map.glb'):
+    for name, up in (('map.ply', 2), ('map.glb', 1)):
         scene = trimesh.load_scene(folder / name)
-        assert scene.area == pytest.approx(area, rel=0.02)
-        low, high = scene.bounds
-        assert (high - low)[1 if name == 'map.glb' else 2] < 3
+        assert scene.area == pytest.approx(area, rel=0.02) and np.ptp(scene.bounds[:, up]) < 3
     picture = ET.parse(folder / 'plan.svg').getroot()
     titles = [e.text for e in picture.iter('{http://www.w3.org/2000/svg}title')]
     assert sum('standard deviation' in title for title in titles) >= len(walls)
@@ -210,13 +200,11 @@ def test_right_angles_are_exact_only_where_the_covariance_allows_it():
     for before, after in zip(walls, squared, strict=True):
         # It turns about where it is known best, and the outline lies on it.
         assert after.normal @ before.centroid + after.distance == pytest.approx(0, abs=1e-3)
-        corners = after.outline.hull
-        assert np.allclose(corners @ after.normal + after.distance, 0, atol=1e-9)
+        assert np.allclose(after.outline.hull @ after.normal, -after.distance, atol=1e-9)
 
 
 def test_up_is_known_as_well_as_its_deviation_says():
-    random, gaps = np.random.default_rng(5), []
-    sigma = np.radians(0.5)
+    random, gaps, sigma = np.random.default_rng(5), [], np.radians(0.5)
     for _ in range(60):
         turn = Rotation.random(random_state=random.integers(10**6))
         planes = []
@@ -225,8 +213,7 @@ def test_up_is_known_as_well_as_its_deviation_says():
             axis *= random.normal(0, sigma) * np.sqrt(2) / np.linalg.norm(axis)
             off = Rotation.from_rotvec(axis).apply(normal)
             planes.append(plane(k, turn.apply(off), turn.apply([0.5, k, 1]), sigma))
-        looked = turn.apply([0.3, 0.2, 1])
-        up = estimate_up(planes, looked, np.radians(10))
+        up = estimate_up(planes, turn.apply([0.3, 0.2, 1]), np.radians(10))
         gaps.append(np.arccos(np.clip(up.direction @ turn.apply([0, 0, 1]), -1, 1)) / up.deviation)
     # Of two directions.
     assert 0.3 < np.mean(np.square(gaps)) / 2 < 2
@@ -255,13 +242,10 @@ def test_stairs_of_several_frames_are_one_flight():
     assert (first.direction, second.direction) == ('up', 'down')
     assert str(first) == 'stairs up, 4 x 0.17 / 0.28 m'
     # Upwards along x, and downwards along y, away from the camera.
-    np.testing.assert_allclose(
-        first.edges[:, :, 0].mean(axis=1), 2 + 0.28 * np.arange(5), atol=0.02
-    )
+    for flight, axis, begin, count in ((first, 0, 2, 5), (second, 1, 3, 4)):
+        places = flight.edges[:, :, axis].mean(axis=1)
+        np.testing.assert_allclose(places, begin + 0.28 * np.arange(count), atol=0.02)
     np.testing.assert_allclose(np.ptp(first.edges[:, :, 1], axis=1), 1.2, atol=0.15)
-    np.testing.assert_allclose(
-        second.edges[:, :, 1].mean(axis=1), 3 + 0.28 * np.arange(4), atol=0.02
-    )
     assert flights([]) == []
 
 
@@ -279,7 +263,5 @@ def test_stairs_are_in_every_drawing(tmp_path):
     assert stairs['properties']['treads'] == 1 and stairs['properties']['direction'] == 'up'
     group = ET.fromstring(svg(plan)).find("{*}g[@class='stairs']")
     assert group.find('{*}title').text == str(flight)
-    assert [(line.get('x1'), line.get('y2')) for line in group.findall('{*}line')] == [
-        ('1.0', '-1.0'),
-        ('1.28', '-1.0'),
-    ]
+    drawn = [(line.get('x1'), line.get('y2')) for line in group.findall('{*}line')]
+    assert drawn == [('1.0', '-1.0'), ('1.28', '-1.0')]

@@ -115,25 +115,6 @@ def test_an_outline_ends_before_the_horizon():
     assert (np.abs(60 * x / z).round(3) == 40).all() and len(z) == 4
 
 
-def test_extents_of_a_turned_rectangle():
-    # 1.2 m by 0.5 m on an oblique plane, its long side turned by 30 degrees in it.
-    across = np.cross(NORMAL, [0, 1, 0])
-    across /= np.linalg.norm(across)
-    long = np.cos(np.pi / 6) * across + np.sin(np.pi / 6) * np.cross(NORMAL, across)
-    long *= np.sign(long[0])
-    centre = np.array([0.0, 0.1, 0.0])
-    centre[2] = -(DISTANCE + NORMAL @ centre) / NORMAL[2]
-    image = plane_image()
-    points = image.points.astype(float) - centre
-    inside = (np.abs(points @ long) < 0.6) & (np.abs(points @ np.cross(NORMAL, long)) < 0.25)
-    (plane,) = fit_planes(inside.astype(np.uint16), image, KINECT)
-    pixel = np.linalg.norm(centre) / CAMERA.fx / 0.5  # on the oblique plane
-    np.testing.assert_allclose(plane.extents, (1.2, 0.5), atol=2 * pixel)
-    np.testing.assert_allclose(plane.centre, centre, atol=2 * pixel)
-    assert plane.area == pytest.approx(0.6, rel=0.01)
-    assert frame_of(plane)[:, 0] @ long > np.cos(np.radians(0.5))
-
-
 @FORMS
 def test_pixels_of_a_neighbour_at_the_border_do_not_turn_the_plane(form):
     labels = boxes((100, 100, 200, 300))

@@ -121,17 +121,6 @@ def test_a_picture_before_a_wall_is_a_plane(distance, degrees):
     assert (here == hung).mean() > 0.98 and (there == behind).mean() > 0.98
 
 
-def test_faces_of_twenty_pixels_are_planes_of_their_own():
-    """Of 300 pixels of VGA in blocks, before a wall."""
-    camera = kinect_camera()
-    depth = np.full(camera.shape, 2000, np.uint16)
-    for size, left in ((20, 100), (30, 300), (16, 500)):
-        depth[200 : 200 + size, left : left + size] = 1800
-    result = segmented(depth, camera)
-    assert [int(result.labels[205, left]) > 1 for left in (105, 305, 505)] == [True, True, False]
-    assert len(result.planes) == 3
-
-
 @pytest.mark.parametrize('offset', range(4))
 def test_a_board_a_third_larger_than_the_smallest_plane_is_found_wherever_it_is(offset):
     """Blocks that its rim crosses are not its own."""

@@ -120,20 +120,17 @@ def test_parts_of_one_surface_are_large_together():
 
 
 @pytest.mark.parametrize(
-    ('degrees', 'where', 'role'),
+    ('within', 'beyond', 'where', 'role'),
     [
-        (9.9, BOTTOM, 'floor'),
-        (10.1, BOTTOM, 'other'),
-        (79.9, LEFT, 'other'),
-        (80.1, LEFT, 'wall'),
-        (99.9, LEFT, 'wall'),
-        (100.1, LEFT, 'other'),
-        (169.9, TOP, 'other'),
-        (170.1, TOP, 'ceiling'),
+        (9.9, 10.1, BOTTOM, 'floor'),
+        (80.1, 79.9, LEFT, 'wall'),
+        (99.9, 100.1, LEFT, 'wall'),
+        (170.1, 169.9, TOP, 'ceiling'),
     ],
 )
-def test_tolerance(degrees, where, role):
-    assert roles(planes((where, tilted(degrees), 1.5)), LEVEL) == [role]
+def test_tolerance(within, beyond, where, role):
+    for degrees, expected in ((within, role), (beyond, 'other')):
+        assert roles(planes((where, tilted(degrees), 1.5)), LEVEL) == [expected]
 
 
 def test_up_of_any_length_in_the_frame_of_a_tilted_camera():

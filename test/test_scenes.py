@@ -61,7 +61,7 @@ def test_exact_hits(solid, direction, distance, face):
 
 def inside(solid: Solid, points, margin=1e-6):
     """Whether points lie in a solid, by a margin."""
-    homogeneous = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1)
+    homogeneous = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1)
     values = np.einsum('...i,fij,...j->...f', homogeneous, solid.faces, homogeneous)
     return (values < -margin).all(axis=-1)
 
@@ -106,14 +106,9 @@ def test_face_cut_in_two_gives_two_regions_of_one_face():
     planes = np.array([[0, 0, -1, 3.0], [0, 0, -1, 2.0], [np.nan] * 4])
     labels, regions = visible_regions(face, planes)
     # The pixel at the lower right touches the middle region only through a corner.
-    expected = [[1, 4, 2, 2], [1, 4, 2, 0], [1, 4, NOT_PLANAR, 3]]
-    assert labels.tolist() == expected
-    assert [(r.label, r.face, r.count, r.distance) for r in regions] == [
-        (1, 0, 3, 3.0),
-        (2, 0, 3, 3.0),
-        (3, 0, 1, 3.0),
-        (4, 1, 3, 2.0),
-    ]
+    assert labels.tolist() == [[1, 4, 2, 2], [1, 4, 2, 0], [1, 4, NOT_PLANAR, 3]]
+    told = [(r.label, r.face, r.count, r.distance) for r in regions]
+    assert told == [(1, 0, 3, 3.0), (2, 0, 3, 3.0), (3, 0, 1, 3.0), (4, 1, 3, 2.0)]
 
 
 @pytest.mark.parametrize('build', [scenes.kinect_room, scenes.curved_scene])

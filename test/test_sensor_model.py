@@ -68,8 +68,7 @@ def test_the_standard_error_of_the_noise_is_what_it_scatters_by():
 
 def test_noise_of_the_range_is_told_from_that_of_its_inverse():
     random = np.random.default_rng(2)
-    inverse = three_planes()
-    smooth = smooth_field(CAMERA.shape, (2.0, 2.0), random)
+    inverse, smooth = three_planes(), smooth_field(CAMERA.shape, (2.0, 2.0), random)
     for noise, error in ((random.normal(size=CAMERA.shape), 0.15), (smooth, 0.25)):
         sensor = sensor_of(inverse + 0.004 * inverse**2 * noise)
         assert sensor.range_noise == pytest.approx(0.004, rel=error)
@@ -200,16 +199,11 @@ def test_what_noise_hides_is_not_made_more_of(seed):
     assert sensor.distortion < 1.5 * (creases / depth**2).std()
 
 
-@pytest.mark.parametrize('step', [0.005, 0.02])
-def test_depth_rounded_to_steps_tells_the_step(step):
-    inverse = three_planes()
-    with np.errstate(divide='ignore'):
-        sensor = sensor_of(1 / (step * np.rint(1 / inverse / step)))
-    assert sensor.range_quantum == pytest.approx(step, rel=0.01) and sensor.quantum == 0
-    assert sensor.range_noise >= 0.99 * step / np.sqrt(12)
-
-
-def test_disparity_rounded_to_steps_tells_the_step():
+def test_depth_and_disparity_rounded_to_steps_tell_the_step():
+    for step in (0.005, 0.02):
+        sensor = sensor_of(1 / (step * np.rint(1 / three_planes() / step)))
+        assert sensor.range_quantum == pytest.approx(step, rel=0.01) and sensor.quantum == 0
+        assert sensor.range_noise >= 0.99 * step / np.sqrt(12)
     random = np.random.default_rng(6)
     inverse = three_planes() + 0.001 * smooth_field(CAMERA.shape, (2.0, 2.0), random)
     sensor = sensor_of(0.0029 * np.rint(inverse / 0.0029))

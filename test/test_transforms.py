@@ -185,7 +185,7 @@ TURNS = np.concatenate(
 )
 
 
-def test_quaternions():
+def test_quaternions_and_matrices_of_turns():
     turns, truth = Rotation.from_rotvec(TURNS).as_matrix(), Rotation.from_rotvec(TURNS).as_quat()
     found = quaternions(turns)
     assert (found[:, 3] >= 0).all()
@@ -196,9 +196,6 @@ def test_quaternions():
     # One alone is that of many.
     assert [quaternions(turn).tolist() for turn in turns] == found.tolist()
     assert quaternions(turns[:0]).shape == (0, 4)
-
-
-def test_matrices_of_quaternions_and_of_turns():
     for turn in TURNS:
         truth = Rotation.from_rotvec(turn)
         assert np.abs(rotation_matrix(truth.as_quat()) - truth.as_matrix()).max() < 1e-15
