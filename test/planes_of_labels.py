@@ -2,11 +2,12 @@
 
 import numpy as np
 
-from rangeseg_ros import Plane
+from rangeseg_ros import Config, Plane, RangeImage
 from rangeseg_ros.core.description.planes import describe_regions
 from rangeseg_ros.core.description.shapes import Shape
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.mapping.map_planes import MapOutline
+from rangeseg_ros.core.sensing.sensor import SensorModel
 
 SQUARE = ((-1, -1, 2), (-1, 1, 2), (1, 1, 2), (1, -1, 2))
 
@@ -14,6 +15,18 @@ SQUARE = ((-1, -1, 2), (-1, 1, 2), (1, 1, 2), (1, -1, 2))
 def fit_planes(labels, image, sensor):
     """Plane of every region, fitted and described as those of a segmentation."""
     return describe_regions(labels, image, Fits.of(labels, image, sensor), sensor)
+
+
+def painted(camera, *regions):
+    """Labels and planes of (where, normal, distance), painted one over the other."""
+    labels, inverse = np.zeros(camera.shape, np.uint16), np.zeros(camera.shape, np.float32)
+    for label, (where, normal, distance) in enumerate(regions, 1):
+        labels[where] = label
+        # Nothing is seen of the part behind the camera.
+        facing = -camera.rays[where] @ (normal / np.linalg.norm(normal)) / distance
+        inverse[where] = np.maximum(facing, 0)
+    image = RangeImage(camera.rays, inverse, camera)
+    return labels, fit_planes(labels, image, SensorModel.from_config(Config()))
 
 
 def stated_plane(label, hull=SQUARE, holes=()):

@@ -32,6 +32,10 @@ BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 DEPTH, INFO = '/depth/image_rect', '/depth/camera_info'
 NODE = [sys.executable, '-c', 'from rangeseg_ros.start import segment_planes; segment_planes()']
 FRAME = 'camera_depth_optical_frame'
+SERVICES = (
+    ('set_parameters', SetParameters),
+    ('set_parameters_atomically', SetParametersAtomically),
+)
 
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
@@ -68,6 +72,17 @@ def ended(process):
         process.wait()
 
 
+@contextmanager
+def started(*arguments, outputs=('labels',), topics=(), **parameters):
+    """A node with a listener for outputs and a reliable camera."""
+    with (
+        Bench(*arguments, **parameters) as bench,
+        bench.listening(*outputs),
+        bench.camera_on(*topics),
+    ):
+        yield bench
+
+
 def benches(*outputs, **parameters):
     """Fixtures: the node of a module, and it with a listener for outputs and a reliable camera."""
 
@@ -93,14 +108,13 @@ class Bench:
         camera=None,
         namespace='',
         name='segment_planes',
-        command=None,
+        command=NODE,
         **parameters,
     ):
         self.camera = camera or kinect_camera(160, 120)
         self.topics = [f'/{namespace}{topic}'.replace('//', '/') for topic in (DEPTH, INFO)]
         set_to = [word for name in parameters for word in ('-p', f'{name}:={parameters[name]}')]
         self.received = {name: [] for name in [*TYPES, 'diagnostics']}
-        command = command or NODE
         self.inputs = set()
         self.spins = False
         self.errors = tempfile.TemporaryFile('w+')  # noqa: SIM115
@@ -115,16 +129,11 @@ class Bench:
         self.executor = rclpy.executors.SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
         self.name = f'{namespace}/{name}'.lstrip('/')
-        self.node.create_subscription(
-            DiagnosticArray, '/diagnostics', self._on_diagnostics, RELIABLE
-        )
-        self.clients = {
-            kind: self.node.create_client(kind, f'/{self.name}/{service}')
-            for kind, service in (
-                (SetParameters, 'set_parameters'),
-                (SetParametersAtomically, 'set_parameters_atomically'),
-            )
-        }
+        kind, callback = DiagnosticArray, self._on_diagnostics
+        self.node.create_subscription(kind, '/diagnostics', callback, RELIABLE)
+        self.clients = [
+            self.node.create_client(kind, f'/{self.name}/{service}') for service, kind in SERVICES
+        ]
 
     @contextmanager
     def listening(self, *names):
@@ -199,7 +208,7 @@ class Bench:
         self.camera_info.publish(info or self.info())
         self.depth.publish(image or self.image())
 
-    def repeat(self, action, condition, period=0.2, **waiting):
+    def repeat(self, action, condition, period=0.2):
         """Do something again and again until the condition holds; its value."""
         due = 0.0
 
@@ -210,9 +219,9 @@ class Bench:
                 action()
             return condition()
 
-        return self.until(found, **waiting)
+        return self.until(found)
 
-    def reported(self, condition, publish, period=0.2, **waiting):
+    def reported(self, condition, publish):
         """The first diagnostic status that satisfies the condition, while frames come."""
         self.received['diagnostics'].clear()
 
@@ -220,7 +229,7 @@ class Bench:
             statuses = (report.status[0] for report in self.received['diagnostics'])
             return next(filter(condition, statuses), None)
 
-        return self.repeat(publish, found, period, **waiting)
+        return self.repeat(publish, found)
 
     def stream(self):
         """Publish images until one comes back, as best effort has no promise for the first."""
@@ -235,18 +244,19 @@ class Bench:
         return self.labels_of(self.until(answer))
 
     def spin(self, seconds):
-        self.until(lambda: False, seconds, required=False)
+        end = time.monotonic() + seconds
+        self.until(lambda: time.monotonic() > end)
 
-    def until(self, condition, timeout=500.0, required=True):
+    def until(self, condition):
         """Spin until the condition holds; its value.
 
         For nearly as long as a test may take: a loaded machine compiles the kernels for minutes.
         """
-        end = time.monotonic() + timeout
-        while not (value := condition()) and time.monotonic() < end:
+        end = time.monotonic() + 500
+        while not (value := condition()):
             assert self.process.poll() is None, f'the node has ended: {self.complaints()}'
+            assert time.monotonic() < end, f'not in time: {self.complaints()}'
             self.executor.spin_once(timeout_sec=0.02)
-        assert value or not required, f'not within {timeout} s: {self.complaints()}'
         return value
 
     def header(self):
@@ -289,10 +299,10 @@ class Bench:
 
     def set_parameters(self, atomically=False, **values):
         """Set parameters by the node's service; its results."""
-        kind = SetParametersAtomically if atomically else SetParameters
+        client = self.clients[atomically]
         parameters = [Parameter(n, value=v).to_parameter_msg() for n, v in values.items()]
-        self.until(self.clients[kind].service_is_ready)
-        future = self.clients[kind].call_async(kind.Request(parameters=parameters))
+        self.until(client.service_is_ready)
+        future = client.call_async(client.srv_type.Request(parameters=parameters))
         self.until(future.done)
         return future.result().result if atomically else future.result().results
 

@@ -16,7 +16,17 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.qos import ReliabilityPolicy
-from ros_bench import BEST_EFFORT, DEPTH, INFO, Bench, benches, corner_depth, ended, values_of
+from ros_bench import (
+    BEST_EFFORT,
+    DEPTH,
+    INFO,
+    Bench,
+    benches,
+    corner_depth,
+    ended,
+    started,
+    values_of,
+)
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
 
 from rangeseg_ros import Config, RangeImage, Segmenter
@@ -207,11 +217,8 @@ def test_frames_come_out_in_their_order(bench, expected):
 
 def test_namespace_and_remapping_take_the_camera_info_along(expected):
     topics = '/robot/camera/depth/image_raw', '/robot/camera/depth/camera_info'
-    with (
-        Bench('-r', 'depth/image_rect:=camera/depth/image_raw', namespace='robot') as bench,
-        bench.listening('labels'),
-        bench.camera_on(*topics),
-    ):
+    remapping = '-r', 'depth/image_rect:=camera/depth/image_raw'
+    with started(*remapping, namespace='robot', topics=topics) as bench:
         np.testing.assert_array_equal(bench.segment(), expected)
 
 

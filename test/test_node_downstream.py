@@ -8,8 +8,8 @@ import pytest
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from recordings import Recording
-from ros_bench import DEPTH, FRAME, Bench, assert_replayed, benches
+from recordings import record
+from ros_bench import DEPTH, FRAME, assert_replayed, benches, started
 from sensor_msgs.msg import Imu
 
 from rangeseg_ros import ROLES, Camera, Config, planes_from_message
@@ -72,24 +72,16 @@ def test_ids_outlive_a_change_of_parameters_and_end_with_time_running_back(bench
 def test_node_and_replay_say_the_same_of_a_recording(tmp_path):
     """All topics, byte for byte: another node, as ids are those since its start."""
     camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
-    frames = [(10**18 + n * 33_333_333, room(camera, WALL - 0.01 * n)) for n in range(4)]
-    recording = Recording()
-    for stamp, depth in frames:
-        recording.add_camera(stamp)
-        recording.add_image(stamp, depth)
-    recording.write(tmp_path / 'recording')
+    frames = [room(camera, WALL - 0.01 * n) for n in range(4)]
+    record(tmp_path / 'recording', 'mcap', frames)
     config = Config(odometry=True)
     Replay(tmp_path / 'recording', tmp_path, config, topics=tuple(OUTPUTS)).run()
     kinds = {name: output.kind for name, output in OUTPUTS.items()} | {'odometry': ODOMETRY}
-    with (
-        Bench(odometry=True, namespace='robot', camera=camera) as bench,
-        bench.listening(*kinds),
-        bench.camera_on(),
-    ):
-        for stamp, depth in frames:
+    with started(outputs=kinds, odometry=True, namespace='robot', camera=camera) as bench:
+        for n, depth in enumerate(frames):
             image = bench.image(depth)
             image.header.frame_id = 'optical'
-            image.header.stamp.sec, image.header.stamp.nanosec = divmod(stamp, 10**9)
+            image.header.stamp.sec, image.header.stamp.nanosec = 10**9, n * 33_333_333
             bench.segment(image)
         bench.until(lambda: all(len(bench.received[name]) == len(frames) for name in kinds))
     assert_replayed(bench, tmp_path, kinds, len(frames))

@@ -15,7 +15,7 @@ from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
 from recordings import Recording
-from ros_bench import FRAME, Bench, assert_replayed, values_of
+from ros_bench import FRAME, assert_replayed, started, values_of
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu, PointCloud2
 from visualization_msgs.msg import MarkerArray
@@ -82,8 +82,8 @@ def later(stamp, seconds):
 def test_what_is_missing_is_said_where_there_is_no_tf():
     if find_spec('tf2_msgs'):
         pytest.skip('tf2_msgs is installed')
-    bench = Bench(gravity_frame='base_footprint', fixed_frame='odom', stall_timeout=60.0)
-    with bench, bench.listening('labels'), bench.camera_on():
+    frames = {'gravity_frame': 'base_footprint', 'fixed_frame': 'odom'}
+    with started(**frames, stall_timeout=60.0) as bench:
         assert bench.segment().any()
         status = bench.status(lambda s: 'tf2_msgs' in s.message)
         assert 'ros-jazzy-tf2-msgs' in status.message
@@ -143,7 +143,7 @@ def test_node_and_replay_place_the_same_planes_whatever_becomes_of_tf(tmp_path, 
         time = Time(nanoseconds=stamp).to_msg()
         return tf_messages(transforms=[transform(parent, child, time, turn, shift)])
 
-    with Bench(camera=camera, **settings) as bench, bench.listening(*topics), bench.camera_on():
+    with started(outputs=topics, camera=camera, **settings) as bench:
         static = bench.node.create_publisher(tf_messages, '/tf_static', LATCHED)
         moving = bench.node.create_publisher(tf_messages, '/tf', 100)
         static.publish(message(*still))
@@ -190,13 +190,13 @@ def test_without_an_up_there_is_no_terrain(tf_messages):
         ground = np.count_nonzero(np.frombuffer(terrain.data, np.uint8) == 1)
         return ground, obstacles.width, grid.data.count(0)
 
-    with Bench(**options) as bench, bench.listening(*topics), bench.camera_on():
+    with started(outputs=topics, **options) as bench:
         assert published(bench)[0] == 0
         # Again and again: a node that hears nothing for a while says that instead.
         status = bench.reported(lambda s: 'no terrain' in s.message, lambda: published(bench))
         assert status.level == DiagnosticStatus.ERROR and 'up is not known' in status.message
         robot = Robot(bench, tf_messages)
-        bench.repeat(lambda: None, lambda: published(bench, robot=robot)[0] > 0)
+        bench.until(lambda: published(bench, robot=robot)[0] > 0)
         ground, obstacles, free = published(bench)  # tf has stopped
         assert ground > 1000 and obstacles == 0 and free > 100
         assert published(bench, ahead=60) == (0, 0, 0)
@@ -229,8 +229,7 @@ def test_without_an_up_there_is_no_terrain(tf_messages):
 
 @pytest.fixture(scope='module')
 def robot(tf_messages):
-    topics = 'labels', 'planes', 'markers'
-    with Bench(**FRAMES, tf_timeout=20.0) as bench, bench.listening(*topics), bench.camera_on():
+    with started(outputs=('labels', 'planes', 'markers'), **FRAMES, tf_timeout=20.0) as bench:
         yield Robot(bench, tf_messages)
 
 

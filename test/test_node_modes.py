@@ -10,7 +10,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from message_classes import cdr
 from processes import python
-from ros_bench import Bench, benches, values_of
+from ros_bench import Bench, benches, started, values_of
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter, corrected
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN
@@ -132,11 +132,8 @@ def test_all_topics_of_terrain_leave_the_body_out(tmp_path):
     given = dict(zip(('up_x', 'up_y', 'up_z'), map(float, UP), strict=True))
     given |= {'sensor_height': HEIGHT, 'mask': str(tmp_path / 'mask.png')}
     depth = head_of_a_stair(body)
-    with (
-        Bench(camera=CAMERA, namespace='masked', **given) as bench,
-        bench.listening('labels', *STAMPED, *MARKERS),
-        bench.camera_on(),
-    ):
+    outputs = 'labels', *STAMPED, *MARKERS
+    with started(outputs=outputs, camera=CAMERA, namespace='masked', **given) as bench:
         message = bench.image(depth)
         bench.segment(message)
         bench.until(lambda: all(bench.received[name] for name in (*STAMPED, *MARKERS)))

@@ -97,8 +97,7 @@ def test_recent_events_and_their_rate(clock):
     for _ in range(31):
         window.add()
         clock.now += 0.1
-    assert window.recent() == 31
-    assert window.rate() == pytest.approx(10)
+    assert window.recent() == 31 and window.rate() == pytest.approx(10)
     clock.now += counting.WINDOW
     window.add(3)
     assert (window.recent(), window.total, window.rate()) == (3, 34, 0.0)

@@ -15,7 +15,7 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from processes import python
-from ros_bench import DEPTH, NODE, Bench, ended, values_of
+from ros_bench import DEPTH, NODE, Bench, ended, started, values_of
 
 from rangeseg_ros.ros.parameters import NodeConfig
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
@@ -34,11 +34,7 @@ def test_where_there_is_no_rclpy_it_says_so():
 
 def test_a_first_start_says_that_it_compiles(tmp_path, monkeypatch):
     monkeypatch.setenv('NUMBA_CACHE_DIR', os.fspath(tmp_path))
-    with (
-        Bench(stall_timeout=0.5, namespace='first') as bench,
-        bench.listening('labels'),
-        bench.camera_on(),
-    ):
+    with started(stall_timeout=0.5, namespace='first') as bench:
         told = r'no output for .* s: compiling kernels'
         status = bench.reported(lambda s: re.match(told, s.message), bench.send)
         assert status.level == DiagnosticStatus.ERROR
@@ -49,8 +45,7 @@ def test_a_first_start_says_that_it_compiles(tmp_path, monkeypatch):
 @pytest.mark.parametrize('presses', [1, 2])
 def test_interrupted_during_a_computation(presses):
     slow = {'method': 'normals', 'exact': True, 'camera': kinect_camera(320, 240)}
-    bench = Bench(namespace='busy', **slow)
-    with bench, bench.listening('labels'), bench.camera_on():
+    with started(namespace='busy', **slow) as bench:
         bench.send()
         bench.status(lambda status: 'segmenting' in values_of(status)['doing'])
         assert not bench.received['labels'], 'the computation is over'
@@ -89,24 +84,19 @@ def test_bad_arguments_end_with_one_line():
         assert line.startswith('segment_planes: ') and words in line
 
 
-def test_parameters_of_other_nodes_in_a_shared_file_are_warned_of(tmp_path):
+def test_it_starts_with_a_shared_file_and_no_place_for_log_files_and_warns_of_both(tmp_path):
     shared = tmp_path / 'shared.yaml'
     shared.write_text(
         '/**:\n  ros__parameters:\n    of_another: 1\n    min_pixels: 7\n'
         '    qos_overrides: {/scan: {subscription: {depth: -1}}}\n'
     )
-    with Bench('--params-file', os.fspath(shared), namespace='shared') as bench:
-        bench.until(lambda: 'will subscribe' in bench.log())
-        for name in ('of_another', 'qos_overrides./scan.subscription.depth'):
-            assert f"unknown parameter '{name}'" in bench.log()
-
-
-def test_without_a_place_for_log_files_it_starts_and_says_so():
     command = ['/usr/bin/env', 'ROS_LOG_DIR=/proc/none', *NODE]
-    with Bench(command=command, namespace='logless') as bench:
+    with Bench('--params-file', os.fspath(shared), command=command, namespace='shared') as bench:
         said = 'will subscribe', '/proc/none cannot be written to'
         bench.until(lambda: all(part in bench.log() for part in said))
         assert bench.log().count(said[1]) == 1
+        for name in ('of_another', 'qos_overrides./scan.subscription.depth'):
+            assert f"unknown parameter '{name}'" in bench.log()
 
 
 def test_help_names_every_parameter():

@@ -58,8 +58,7 @@ def test_undefined_at_the_border_and_beside_shadow_and_nowhere_else(method, reac
     found = np.isfinite(method(RangeImage.from_depth(depth, CAMERA))[..., 0])
     rows, columns = np.indices(found.shape)
     inside = (rows >= reach) & (rows < 30 - reach) & (columns >= reach) & (columns < 40 - reach)
-    assert not found[~inside].any()
-    assert not found[[15, 15, 15 - reach], [20, 20 + reach, 20]].any()
+    assert not found[~inside].any() and not found[[15, 15, 15 - reach], [20, 20 + reach, 20]].any()
     assert found[inside & (np.hypot(rows - 15, columns - 20) > 1.5 * reach)].all()
 
 
@@ -90,8 +89,7 @@ def test_unit_vectors_towards_the_sensor_all_different(count):
     found = directions(count)
     assert found.shape == (count, 3)
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-12)
-    assert (found[:, 2] < 0).all()
-    assert len(np.unique(found.round(9), axis=0)) == count
+    assert (found[:, 2] < 0).all() and len(np.unique(found.round(9), axis=0)) == count
 
 
 def test_directions_leave_no_large_gap():

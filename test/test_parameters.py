@@ -222,8 +222,7 @@ def test_whoever_waits_is_let_go_at_the_end(monkeypatch):
     monkeypatch.setattr(settings, 'prepare', lambda *arguments: release.wait())
     used = settings_of()
     used.close()
-    assert used.in_use() is None
-    assert not used.ready_for('labels')
+    assert used.in_use() is None and not used.ready_for('labels')
     release.set()
 
 
@@ -311,8 +310,7 @@ def test_ground_and_stairs_are_told():
     told = {'ground': 'ground 1.20 m below, confidence 0.98', 'stairs': ['up 4 x 0.17 / 0.28 m']}
     found = status(found=result(**told))
     assert values_of(found)['ground'] == told['ground']
-    assert values_of(found)['stairs'] == told['stairs'][0]
-    assert found.level == DiagnosticStatus.OK
+    assert values_of(found)['stairs'] == told['stairs'][0] and found.level == DiagnosticStatus.OK
 
 
 def result(verdict=Verdict(), **worked_out):  # noqa: B008

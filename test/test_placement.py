@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planes_of_labels import fit_planes
+from planes_of_labels import painted
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import Camera, Config, RangeImage
@@ -12,7 +12,6 @@ from rangeseg_ros.core.mapping.map_planes import moved_planes
 from rangeseg_ros.core.mapping.mount import mount_of
 from rangeseg_ros.core.mapping.placement import Placement, Up, UpFilter, find_placement
 from rangeseg_ros.core.mapping.transforms import Transform, TransformError
-from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.simulation.render import simulate
@@ -23,6 +22,7 @@ from rangeseg_ros.simulation.solids import box, half_space
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 PITCH = Rotation.from_euler('y', 30, degrees=True)
 MOUNT = Transform((PITCH * Rotation.from_matrix(OPTICAL_IN_BODY)).as_matrix(), np.array([0, 0, 1]))
+SLANTED = np.s_[:, :], (0.2, -0.3, -0.9), 1.0
 UP = (0, -np.cos(np.radians(30)), -np.sin(np.radians(30)))
 
 
@@ -63,17 +63,11 @@ def test_without_it_the_accelerometer_tells_up_and_then_the_parameters():
     assert found.sources['up'].startswith('the parameters up_x, up_y, up_z; no imu in elsewhere')
 
 
-def planes_of(camera):
-    inverse = (-CAMERA.rays @ np.array([0.2, -0.3, -0.9])).astype(np.float32)
-    image = RangeImage(CAMERA.rays, inverse, camera)
-    return fit_planes(np.ones(CAMERA.shape, np.uint16), image, SensorModel.from_config(Config()))
-
-
 def test_planes_of_a_camera_elsewhere_are_those_planes_moved():
     """Also their covariance, that of the distance by the lever of the move."""
     there = replace(CAMERA, place=(3.0, -2.0, 0.5))
-    (plane,) = planes_of(there)
-    (expected,) = moved_planes(planes_of(CAMERA), Transform(np.eye(3), np.array(there.place)))
+    (_, here), (_, (plane,)) = (painted(camera, SLANTED) for camera in (CAMERA, there))
+    (expected,) = moved_planes(here, Transform(np.eye(3), np.array(there.place)))
     np.testing.assert_allclose(plane.normal, expected.normal, atol=1e-12)
     assert plane.distance == pytest.approx(expected.distance, abs=1e-9)
     np.testing.assert_allclose(plane.covariance, expected.covariance, rtol=1e-6)
@@ -81,8 +75,8 @@ def test_planes_of_a_camera_elsewhere_are_those_planes_moved():
 
 
 def test_planes_of_another_frame_are_the_same_planes():
-    planes = planes_of(CAMERA)
-    (plane,), (moved,) = planes, moved_planes(planes, MOUNT)
+    _, (plane,) = painted(CAMERA, SLANTED)
+    (moved,) = moved_planes([plane], MOUNT)
     points = plane.hull @ MOUNT.rotation.T + MOUNT.shift
     np.testing.assert_allclose(moved.hull, points, atol=1e-12)
     np.testing.assert_allclose(moved.hull @ moved.normal, -moved.distance, atol=1e-6)

@@ -280,8 +280,7 @@ def test_frames_without_stamps_make_a_map():
         for _ in range(times):
             sequence.segment(image, 0, pose=pose)
         areas.append(sum(plane.area for plane in sequence.map.planes))
-    assert len(sequence.map) > 3
-    assert {plane.last_stamp for plane in sequence.map.planes} == {0}
+    assert len(sequence.map) > 3 and {plane.last_stamp for plane in sequence.map.planes} == {0}
     assert sequence.map.begun_anew == ''
     # Outlines grow all the same.
     assert areas[1] > 1.02 * areas[0]
@@ -304,8 +303,7 @@ def test_parameters_changed_while_running_keep_the_map():
             sequence.config = Config(min_pixels=300, map_resolution=0.1, distortion_length=20.0)
         image, pose = seen(k)
         sequence.segment(image, 10**9 + k * 10**9 // 30, pose=pose)
-    assert 3 < len(before) <= len(before & ids_of(sequence)) + 1
-    assert sequence.map.begun_anew == ''
+    assert 3 < len(before) <= len(before & ids_of(sequence)) + 1 and sequence.map.begun_anew == ''
     # Another frame is another map.
     sequence.config = Config(min_pixels=300, fixed_frame='odom')
     assert len(sequence.map) == 0 and sequence.map.begun_anew == 'its frame has changed'
@@ -375,6 +373,5 @@ def test_a_grid_has_the_area_and_the_outline_of_what_was_seen():
 def test_a_sliver_between_cells_is_seen():
     grid = PlaneGrid(0.1)
     grid.add(grid.fill([[np.array([[0.01, 0.02], [0.05, 0.02], [0.05, 0.03]])]]), HIT)
-    assert grid.area == pytest.approx(0.01)
-    assert grid.distance(np.array([0.03, 0.02])) == 0
+    assert grid.area == pytest.approx(0.01) and grid.distance(np.array([0.03, 0.02])) == 0
     assert grid.distance(np.array([0.05, 1.05])) == pytest.approx(1.0)

@@ -95,8 +95,7 @@ def test_outline_and_area_agree_and_run_counter_clockwise():
     (plane,) = fit_planes(labels, plane_image(), KINECT)
     outer = polygon_area(plane.hull, plane.normal)
     holes = [polygon_area(hole, plane.normal) for hole in plane.holes]
-    assert len(plane.hull) == 6 and len(holes) == 1
-    assert outer > 0 > holes[0]
+    assert len(plane.hull) == 6 and len(holes) == 1 and outer > 0 > holes[0]
     # Within a quarter of a pixel along the border of 1060 pixels, of 39000.
     assert outer + sum(holes) == pytest.approx(plane.area, rel=0.25 * 1060 / 39000)
 
@@ -123,8 +122,7 @@ def test_pixels_of_a_neighbour_at_the_border_do_not_turn_the_plane(form):
     inverse[100:200, 296:300] += 10 * QUANTUM
     (plane,) = fit_planes(labels, form(RangeImage(CAMERA.rays, inverse, CAMERA)), KINECT)
     np.testing.assert_allclose(plane.normal, NORMAL, atol=1e-6)
-    assert plane.confidence == pytest.approx(0.98, abs=1e-6)
-    assert plane.count == 20000
+    assert plane.confidence == pytest.approx(0.98, abs=1e-6) and plane.count == 20000
 
 
 def test_rough_surfaces_inspire_less_confidence():

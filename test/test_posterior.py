@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
-from rangeseg_ros.core.by_planes.posterior import _evidence, _explained, plane_probabilities
+from rangeseg_ros.core.by_planes.posterior import _evidence, plane_probabilities
 from rangeseg_ros.core.by_planes.shifts import shift_at, shifts
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.region_sums import INVERSE, PLACE, RAY, WEIGHT
@@ -16,16 +16,16 @@ from rangeseg_ros.simulation.sensors.kinect import QUANTUM
 
 CAMERA = Camera(320, 240, 292.0, 292.0, 159.5, 119.5)
 SENSOR = SensorModel.from_config(Config(), CAMERA.shape)
+X = CAMERA.rays[..., 0].astype(float)
 WALL = CAMERA.rays.astype(float) @ np.array([0.1, 0, 0.5])
 
 
 def cylinder(radius, distance=2.0):
     """Inverse depth of a standing cylinder, 0 beside it."""
-    x = CAMERA.rays[..., 0].astype(float)
     # Nearer root of (z x)^2 + (z - c)^2 = r^2.
     centre = distance + radius
-    root = centre**2 - (1 + x**2) * (centre**2 - radius**2)
-    depth = (centre - np.sqrt(np.maximum(root, 0))) / (1 + x**2)
+    root = centre**2 - (1 + X**2) * (centre**2 - radius**2)
+    depth = (centre - np.sqrt(np.maximum(root, 0))) / (1 + X**2)
     return np.where(root > 0, 1 / depth, 0)
 
 
@@ -76,10 +76,8 @@ def test_cylinders_are_none(radius, seed):
 
 def folded(angle, column=160):
     """Two walls, 2 m away, that meet at an angle in a column; regions 1 and 2."""
-    x = CAMERA.rays[..., 0].astype(float)
-    crease, half = x[0, column], np.tan(np.radians(angle / 2))
-    left, right = (0.5 * (1 + sign * half * (x - crease)) for sign in (1, -1))
-    return np.minimum(left, right), np.where(x < crease, 1, 2)
+    beyond, half = X - X[0, column], np.tan(np.radians(angle / 2))
+    return 0.5 * (1 - half * np.abs(beyond)), np.where(beyond < 0, 1, 2)
 
 
 @pytest.mark.parametrize('angle', [8, 20, 60, 120])
@@ -104,13 +102,13 @@ def test_facets_of_a_cylinder_are_no_planes_together(radius, distance):
 
 def test_a_wall_that_goes_on_as_a_fillet_is_a_plane():
     """A wall, the quarter of a cylinder that touches it, and a wall at a right angle."""
-    x, radius, depth = CAMERA.rays[..., 0].astype(float), 0.5, 2.0
-    # z = depth up to X = 0; (X - 0)^2 + (z - depth + radius)^2 = radius^2 beyond.
+    radius, depth = 0.5, 2.0
+    # z = depth up to x = 0; (z x)^2 + (z - depth + radius)^2 = radius^2 beyond.
     centre = depth - radius
-    root = centre**2 - (1 + x**2) * (centre**2 - radius**2)
-    bent = (centre + np.sqrt(np.maximum(root, 0))) / (1 + x**2)
-    inverse = np.where(x < 0, 1 / depth, 1 / bent)
-    regions = np.where(x < 0, 1, np.where(x < 0.13, 2, 0))
+    root = centre**2 - (1 + X**2) * (centre**2 - radius**2)
+    bent = (centre + np.sqrt(np.maximum(root, 0))) / (1 + X**2)
+    inverse = 1 / np.where(X < 0, depth, bent)
+    regions = np.select([X < 0, X < 0.13], [1, 2])
     alone, beside = probabilities(inverse, regions), probabilities(inverse, regions, 0, [[1, 2]])
     assert beside[1] == pytest.approx(alone[1], abs=0.01) and beside[1] > 0.5
 
@@ -118,8 +116,7 @@ def test_a_wall_that_goes_on_as_a_fillet_is_a_plane():
 @pytest.mark.parametrize('slope', [0.02, 0.1, 0.2])
 def test_a_bowed_wall_beside_what_does_not_go_on_is_a_plane(slope):
     """The wall bends towards its neighbour, which is flat."""
-    x = CAMERA.rays[..., 0].astype(float)
-    beyond, columns = x - x[0, 270], np.arange(320)
+    beyond, columns = X - X[0, 270], np.arange(320)
     inverse = 0.5 + np.where(beyond < 0, 0.04 * beyond**2, slope * beyond)
     regions = np.where(beyond < 0, 1, 2) * (columns < 310)
     alone, beside = probabilities(inverse, regions), probabilities(inverse, regions, 0, [[1, 2]])
@@ -129,9 +126,8 @@ def test_a_bowed_wall_beside_what_does_not_go_on_is_a_plane(slope):
 
 def test_the_evidence_is_that_of_residuals_along_the_crease():
     """Against least squares of all cells at once."""
-    x, y = np.moveaxis(CAMERA.rays[..., :2].astype(float), -1, 0)
-    inverse = 0.5 + 0.05 * x - 0.2 * x**2 - 0.05 * x * y
-    sums, _, theta, *_ = fitted(inverse, np.where(x < 0.1, 1, 2))
+    inverse = 0.5 + 0.05 * X - 0.2 * X**2 - 0.05 * X * CAMERA.rays[..., 1]
+    sums, _, theta, *_ = fitted(inverse, np.where(X < 0.1, 1, 2))
     found = _evidence(sums, 1, 2, theta, SENSOR, SENSOR.correlated)
     parts = [sums.cells[sums.start[k] : sums.start[k + 1]] for k in (1, 2)]
     cells, part = np.vstack(parts), np.repeat([0, 1], [len(one) for one in parts])
@@ -171,16 +167,6 @@ def test_what_tells_nothing_has_the_prior():
     regions[100:140, 101:160] = 2
     alone, beside = probabilities(WALL, regions), probabilities(WALL, regions, 0, [[1, 2]])
     assert beside.tolist() == alone.tolist()
-
-
-def test_what_a_quadratic_explains_is_what_least_squares_explain():
-    random = np.random.default_rng(5)
-    u, v, residual = random.uniform(-1, 1, (3, 200))
-    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
-    left = [np.linalg.lstsq(terms[:, :count], residual, rcond=None)[1].item() for count in (3, 6)]
-    flat, whole = residual @ residual - left
-    found = _explained(np.vstack([terms.T @ terms, terms.T @ residual]))
-    np.testing.assert_allclose(found, (flat, whole - flat), rtol=1e-6)
 
 
 def test_shifts_are_the_weighted_residuals_around():

@@ -5,12 +5,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from planes_of_labels import fit_planes, stated_plane
+from planes_of_labels import painted, stated_plane
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros import Camera, Config, ConfigError, RangeImage
+from rangeseg_ros import Camera, Config, ConfigError
 from rangeseg_ros.core.ground.roles import RolesError, corners_of, ramps_of, roles, tilt_of
-from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import with_roles
 from rangeseg_ros.messages.markers import of_ramps
 
@@ -23,14 +22,7 @@ LEFT, RIGHT = (slice(40, 80), slice(0, 75)), (slice(40, 80), slice(80, 160))
 
 def planes(*regions):
     """Planes of ((rows, columns), normal, distance) in the frame of a level camera."""
-    labels = np.zeros(CAMERA.shape, np.uint16)
-    inverse = np.zeros(CAMERA.shape, np.float32)
-    for label, (where, normal, distance) in enumerate(regions, 1):
-        labels[where] = label
-        inverse[where] = -CAMERA.rays[where] @ (normal / np.linalg.norm(normal)) / distance
-    assert (inverse[labels > 0] > 0).all()
-    image = RangeImage(CAMERA.rays, inverse, CAMERA)
-    return fit_planes(labels, image, SensorModel.from_config(LEVEL))
+    return painted(CAMERA, *regions)[1]
 
 
 def tilted(degrees):
@@ -106,8 +98,7 @@ def test_small_planes_are_no_floor_wall_or_ceiling():
         ((slice(50, 60), slice(0, 20)), AHEAD, 1),
         ((slice(0, 10), slice(0, 20)), DOWN, 0.5),
     )
-    assert max(plane.area for plane in found) < 0.1
-    assert roles(found, LEVEL) == ['other'] * 3
+    assert max(plane.area for plane in found) < 0.1 and roles(found, LEVEL) == ['other'] * 3
     assert roles(found, Config(role_area=0.001)) == ['floor', 'wall', 'ceiling']
 
 

@@ -106,8 +106,7 @@ def test_a_result_can_be_pickled_with_its_energy(config):
     data = pickle.dumps(result)
     assert len(data) < 100_000  # not with the image
     copy = pickle.loads(data)
-    assert copy.image is None
-    assert (copy.energy, copy.verdict) == (result.energy, result.verdict)
+    assert copy.image is None and (copy.energy, copy.verdict) == (result.energy, result.verdict)
     for name in ('labels', 'normals', 'terrain', 'height'):
         np.testing.assert_array_equal(getattr(copy, name), getattr(result, name))
     for one, other in zip(copy.planes, result.planes, strict=True):

@@ -71,8 +71,7 @@ def test_noise_of_the_range_is_told_from_that_of_its_inverse():
     inverse, smooth = three_planes(), smooth_field(CAMERA.shape, (2.0, 2.0), random)
     for noise, error in ((random.normal(size=CAMERA.shape), 0.15), (smooth, 0.25)):
         sensor = sensor_of(inverse + 0.004 * inverse**2 * noise)
-        assert sensor.range_noise == pytest.approx(0.004, rel=error)
-        assert sensor.noise <= 1e-4
+        assert sensor.range_noise == pytest.approx(0.004, rel=error) and sensor.noise <= 1e-4
 
 
 def tilted_planes(random):
@@ -127,8 +126,7 @@ def test_waves_of_the_range_are_distortion_however_far_a_surface_is(waves, far):
     noise = 6e-4 * random.standard_normal(CAMERA.shape)
     image = RangeImage.from_depth((1 / inverse + waves * field + noise).astype(np.float32), CAMERA)
     result = Segmenter().segment(image)
-    assert 0.7 * waves < result.sensor.range_distortion < 2 * waves
-    assert len(result.planes) == 4
+    assert 0.7 * waves < result.sensor.range_distortion < 2 * waves and len(result.planes) == 4
 
 
 def test_strata_are_ranges_of_equal_size_and_slopes_in_them():

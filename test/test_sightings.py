@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rangeseg_ros import Camera, RangeImage, Transform
 from rangeseg_ros.core.mapping.observations import PlaneSet
 from rangeseg_ros.core.mapping.plane_grid import (
     HIT,
@@ -15,9 +16,6 @@ from rangeseg_ros.core.mapping.plane_grid import (
     passed_through,
     seen_cells,
 )
-from rangeseg_ros.core.mapping.transforms import Transform
-from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.tracking.plane_errors import tangents
 

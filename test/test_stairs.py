@@ -59,8 +59,7 @@ def test_edge_count_rise_and_run(direction, begin, count, rise, run, tmp_path):
     assert stairs.rise == approx(rise, abs=0.01) and stairs.run == approx(run, abs=0.025)
     assert stairs.width == approx(1.1, abs=0.1)
     edge = stairs.edge @ terrain.pose.rotation.T + terrain.pose.position
-    assert edge[:, 0] == approx(begin, abs=0.06)
-    assert np.sort(edge[:, 1]) == approx(sides, abs=0.08)
+    assert edge[:, 0] == approx(begin, abs=0.06) and np.sort(edge[:, 1]) == approx(sides, abs=0.08)
     assert np.abs(edge[:, 2]).max() < 0.03
     # It is written as the contract says, and survives another process.
     path = write_frame(tmp_path, 'a', image, pickle.loads(pickle.dumps(result)), ['stairs'])

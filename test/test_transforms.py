@@ -7,12 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, f
 
-from rangeseg_ros.core.mapping.transforms import (
-    CACHE_TIME,
-    Transform,
-    TransformBuffer,
-    TransformError,
-)
+from rangeseg_ros import Transform
+from rangeseg_ros.core.mapping.transforms import CACHE_TIME, TransformBuffer, TransformError
 from rangeseg_ros.core.rotations import quaternions, rotation_by, rotation_matrix
 from rangeseg_ros.core.significance import LEVEL, chi2_quantile, f_quantile
 

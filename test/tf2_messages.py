@@ -51,11 +51,8 @@ def provide(monkeypatch):
         if problem:
             return f'tf2_msgs is not installed and cannot be built: {problem}'
     packages, libraries = folder / 'lib' / version / 'site-packages', folder / 'lib'
-    for variable, path in (
-        ('PYTHONPATH', packages),
-        ('LD_LIBRARY_PATH', libraries),
-        ('AMENT_PREFIX_PATH', folder),
-    ):
+    variables = 'PYTHONPATH', 'LD_LIBRARY_PATH', 'AMENT_PREFIX_PATH'
+    for variable, path in zip(variables, (packages, libraries, folder), strict=True):
         monkeypatch.setenv(variable, f'{path}:{os.environ.get(variable, "")}'.rstrip(':'))
     monkeypatch.syspath_prepend(str(packages))
     # Loaded by name later, which finds what is loaded already.
@@ -81,33 +78,29 @@ def _build(folder, version):
     messages = Path(spec.origin).parents[1]
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
-        work = Path(scratch)
-        tools = work / 'tools'
-        run = [
-            ([sys.executable, '-m', 'venv', str(tools)], {}),
-            ([str(tools / 'bin/pip'), 'install', '--quiet', *GENERATORS, *TOOLS], {}),
-        ]
+        work, tools = Path(scratch), Path(scratch, 'tools')
+
+        def run(*command, **environment):
+            clean = {k: v for k, v in os.environ.items() if k != 'PYTHONPATH'} | environment
+            return subprocess.run(command, capture_output=True, text=True, env=clean)
+
+        run(sys.executable, '-m', 'venv', tools)
+        run(tools / 'bin/pip', 'install', '--quiet', *GENERATORS, *TOOLS)
         prefixes = f'{tools}:{messages.parents[2]}'
         there = {
             'PYTHONPATH': f'{tools}/lib/{version}/site-packages:{messages}',
             'AMENT_PREFIX_PATH': prefixes,
             'CMAKE_PREFIX_PATH': prefixes,
         }
-        python = tools / 'bin/python'
         (work / 'msg').mkdir()
         (work / 'msg/TFMessage.msg').write_text('geometry_msgs/TransformStamped[] transforms\n')
         (work / 'CMakeLists.txt').write_text(CMAKE)
         (work / 'package.xml').write_text(PACKAGE)
-        options = [f'-DPython3_EXECUTABLE={python}', f'-DPYTHON_EXECUTABLE={python}']
+        options = [f'-D{name}_EXECUTABLE={tools}/bin/python' for name in ('Python3', 'PYTHON')]
         options += [f'-DCMAKE_INSTALL_PREFIX={work}/tf2_msgs', '-DBUILD_TESTING=OFF']
         # It complains at the end of an include directory of Python that no one needs.
-        run.append((['cmake', '-S', scratch, '-B', f'{work}/build', *options], there))
-        run.append((['make', '-C', f'{work}/build', '-j2', '-k', 'install'], there))
-        for command, environment in run:
-            clean = {k: v for k, v in os.environ.items() if k != 'PYTHONPATH'}
-            done = subprocess.run(
-                command, capture_output=True, text=True, env={**clean, **environment}
-            )
+        run('cmake', '-S', scratch, '-B', f'{work}/build', *options, **there)
+        done = run('make', '-C', f'{work}/build', '-j2', '-k', 'install', **there)
         if not (work / f'tf2_msgs/lib/{version}/site-packages/tf2_msgs').exists():
             return (done.stderr or done.stdout).strip().splitlines()[-1:]
         (work / 'tf2_msgs').rename(folder)
