@@ -43,8 +43,7 @@ def planes_of(scene, k, seed):
 
 def still(seed):
     """The same of the first frame of a room."""
-    room = kinect_room(seed)
-    return planes_of(Scene(room.solids, room.poses), 0, seed)
+    return planes_of(kinect_room(seed), 0, seed)
 
 
 def followed(scene, frames, seed=0):
@@ -69,8 +68,7 @@ def errors_of(motion, truth):
 def test_walks_are_followed_and_the_error_is_known():
     values, errors = [], []
     for seed in range(4):
-        room = kinect_room(seed)
-        scene = Scene(room.solids, walk(room.poses[0], seed, 33), room.dark)
+        scene = kinect_room(seed, 33, walk)
         motions, truths = followed(scene, range(0, 33, STEP), seed)
         error = errors_of(motions[-1], truths[-1])
         values.append(error @ np.linalg.solve(motions[-1].covariance, error) / 6)
@@ -252,8 +250,7 @@ def test_the_message_has_pose_and_twist_in_their_frames():
 
 
 def test_the_map_is_in_the_frame_of_the_odometry_without_tf(tmp_path):
-    room, camera = kinect_room(4), Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
-    scene = Scene(room.solids, walk(room.poses[0], 4, 20), room.dark)
+    scene, camera = kinect_room(4, 20, walk), Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
     recording, config = Recording(), Config(odometry=True, min_pixels=60)
     sequence = SequenceSegmenter(config)
     stamps = [10**9 + k * 10**9 // 30 for k in range(0, 20, STEP)]

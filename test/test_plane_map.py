@@ -115,8 +115,7 @@ def on_face(plane, truth):
 
 @pytest.mark.parametrize('seed', [3, 8])
 def test_a_walk_maps_every_face_once_and_better_than_single_frames(seed):
-    room = kinect_room(seed)
-    scene = Scene(room.solids, walk(room.poses[0], seed, 150), room.dark)
+    scene = kinect_room(seed, 150, walk)
     plane_map, random = PlaneMap(), np.random.default_rng(0)
     for k in range(0, 150, 5):
         add(plane_map, scene, k, random)
@@ -196,8 +195,7 @@ def test_what_rays_pass_through_is_gone_within_seconds():
 
 @pytest.mark.parametrize('turn', [0.0, 25.0])
 def test_the_map_follows_a_jump_of_the_fixed_frame(turn):
-    room = kinect_room(4)
-    scene = Scene(room.solids, walk(room.poses[0], 4, 48), room.dark)
+    scene = kinect_room(4, 48, walk)
     sequence, sizes = SequenceSegmenter(CONFIG), []
     turned = Rotation.from_euler('z', turn, degrees=True).as_matrix()
     jump = Transform(turned, np.array([0.6, -0.5, 0.0]))
@@ -249,8 +247,7 @@ def test_a_tread_that_is_taken_for_the_next_is_no_jump():
     np.testing.assert_allclose(heights[:4], 0.17 * np.arange(4), atol=0.03)
 
 
-ROOM = kinect_room(4)
-SCENE = Scene(ROOM.solids, walk(ROOM.poses[0], 4, 40), ROOM.dark)
+SCENE = kinect_room(4, 40, walk)
 
 
 def seen(k, width=320):
