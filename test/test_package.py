@@ -39,12 +39,16 @@ def test_setup_package_xml_and_citation_agree(setup_arguments):
     for tag in ('name', 'version', 'license'):
         assert package.findtext(tag) == setup_arguments[tag]
     assert package.findtext('export/build_type') == 'ament_python'
-    needed = (element.text for element in package.iter('exec_depend'))
-    keys = {key.removeprefix('python3-').removesuffix('-pip').lower() for key in needed}
+    declared = {element.text for element in package.iter('exec_depend')}
+    keys = {key.removeprefix('python3-').removesuffix('-pip').lower() for key in declared}
     aliases = {'pyyaml': 'yaml', 'pillow': 'pil', 'opencv-python-headless': 'opencv'}
     for requirement in setup_arguments['install_requires']:
         name = re.match(r'[\w-]+', requirement)[0].lower()
         assert aliases.get(name, name) in keys
+    # The messages that are used are named.
+    text = '\n'.join(path.read_text() for path in (ROOT / 'rangeseg_ros').rglob('*.py'))
+    used = set(re.findall(r'\b(\w+_(?:msgs|interfaces))(?:/msg/|\.msg )', text))
+    assert {'sensor_msgs', 'rcl_interfaces'} <= used <= declared
 
 
 def test_every_library_that_may_be_missing_is_in_its_extra(setup_arguments):
@@ -61,14 +65,6 @@ def test_segmenting_needs_no_library_of_an_extra():
     code = ''.join(f'import rangeseg_ros.{name}\n' for name in modules)
     code += f'import sys; print(*set(sys.modules) & {set(EXTRAS)!r})'
     assert python(code).stdout == '\n'
-
-
-def test_package_xml_names_the_messages_that_are_used():
-    package = ElementTree.parse(ROOT / 'package.xml').getroot()
-    declared = {element.text for element in package.iter('exec_depend')}
-    text = '\n'.join(path.read_text() for path in (ROOT / 'rangeseg_ros').rglob('*.py'))
-    used = set(re.findall(r'\b(\w+_(?:msgs|interfaces))(?:/msg/|\.msg )', text))
-    assert {'sensor_msgs', 'rcl_interfaces'} <= used <= declared
 
 
 def test_no_test_module_imports_another():
@@ -93,9 +89,8 @@ def test_everything_is_installed_where_ros_looks(setup_arguments):
 
 
 def test_launchers_match_the_console_scripts(setup_arguments):
-    scripts = dict(
-        re.split(r' *= *', script) for script in setup_arguments['entry_points']['console_scripts']
-    )
+    scripts = setup_arguments['entry_points']['console_scripts']
+    scripts = dict(re.split(r' *= *', script) for script in scripts)
     assert set(scripts) == {path.name for path in (ROOT / 'scripts').iterdir()}
     for name, target in scripts.items():
         launcher = ROOT / 'scripts' / name

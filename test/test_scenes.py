@@ -204,7 +204,6 @@ def test_kinect_folder_holds_the_scenes(tmp_path, simulated):
 
     with (output / 'planes.csv').open() as file:
         rows = [row for row in csv.DictReader(file) if row['image'] == names[3]]
-    assert len(rows) == len(expected.planes)
     for row, plane in zip(rows, expected.planes, strict=True):
         assert [int(row['label']), int(row['face'])] == [plane.label, plane.face]
         assert int(row['count']) == (truth == plane.label).sum()
