@@ -12,15 +12,9 @@ from rangeseg_ros.core.by_planes.patches import Nodes, find_patches
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, costs, region_moments
 from rangeseg_ros.core.by_planes.shifts import Shifts
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces
-from rangeseg_ros.core.graphcut.expansion import (
-    GridLabelling,
-    energy,
-    fronts,
-    link_costs,
-    minimise,
-)
+from rangeseg_ros.core.graphcut.expansion import GridLabelling, energy, fronts, minimise
 from rangeseg_ros.core.sensing.blocks import Blocks
-from rangeseg_ros.core.sensing.grid import Grid, View, grid_of
+from rangeseg_ros.core.sensing.grid import View, grid_of
 from rangeseg_ros.core.sensing.moments import RATIO
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.simulation.render import simulate
@@ -123,21 +117,6 @@ def linked(problem, label, labels):
         reached[1:] |= before[:-1] & (down > 0)
         reached[:-1] |= before[1:] & (down > 0)
     return reached & (labels != label)
-
-
-@pytest.mark.parametrize('shape', [(1, 1), (1, 6), (6, 1), (5, 7)])
-def test_links_are_the_weights_on_all_four_sides(shape):
-    random = np.random.default_rng(sum(shape))
-    horizontal = random.random((shape[0], shape[1] - 1)).astype(np.float32)
-    vertical = random.random((shape[0] - 1, shape[1])).astype(np.float32)
-    links = link_costs(Grid(horizontal, vertical), 3.0)
-    expected = np.zeros((4, *shape))
-    expected[0, :, :-1] = expected[2, :, 1:] = 3 * horizontal
-    expected[1, :-1] = expected[3, 1:] = 3 * vertical
-    for p in range(shape[0] * shape[1]):
-        for side, offset in enumerate((1, shape[1], -1, -shape[1])):
-            found = links[side % 2, min(p, p + offset)]
-            assert found == pytest.approx(expected[side].flat[p], rel=1e-6)
 
 
 def test_the_less_new_each_pixel_tells_the_more_unlike_labels_cost():

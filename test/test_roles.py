@@ -5,11 +5,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from planes_of_labels import painted, stated_plane
+from planes_of_labels import painted
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import Camera, Config, ConfigError
-from rangeseg_ros.core.ground.roles import RolesError, corners_of, ramps_of, roles, tilt_of
+from rangeseg_ros.core.ground.roles import RolesError, ramps_of, roles, tilt_of
 from rangeseg_ros.core.sequence import with_roles
 from rangeseg_ros.messages.markers import of_ramps
 
@@ -170,11 +170,3 @@ def test_a_tilt_is_what_most_planes_agree_with(degrees, change, told):
     if told:
         assert found.degrees == pytest.approx(degrees)
         np.testing.assert_allclose(found.up, tilted(degrees), atol=1e-9)
-
-
-def test_corners_go_around_the_rectangle():
-    corners = corners_of(stated_plane(1))
-    np.testing.assert_allclose(corners.mean(axis=0), [0, 0.25, 2], atol=1e-12)
-    np.testing.assert_allclose(np.ptp(corners, axis=0), [2, 1.5, 0], atol=1e-12)
-    sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
-    np.testing.assert_allclose(sides, [1.5, 2, 1.5, 2], atol=1e-12)
