@@ -264,6 +264,15 @@ def test_disparities_and_pictures_are_segmented_as_such(room, kind, levels):
         assert (own & same).sum() > 0.9 * (own | same).sum()
 
 
+def test_what_is_nearest_in_a_picture_may_fill_no_block():
+    frame = simulate(kinect_room(733), Kinect(733), seed=733)
+    near = frame.depth[frame.depth > 0].min()
+    frame.depth[300:340, 300:304] = 0.4 * near
+    frame.depth[296:344:3, 296:310] = 0
+    q = encoding(pictured(frame, 'near is bright', 255))
+    assert 0.5 < (1 - q) * frame.depth.max() / (0.4 * near) < 2
+
+
 def test_only_pictures_begin_at_an_unknown_distance(room):
     """One surface that bends may look like that, and an image of more than 8 bits is measured."""
     image = pictured(room, 'near is dark')

@@ -42,6 +42,7 @@ def encoding(image: RangeImage) -> float | None:
     known = (inverse > 0).all(axis=(1, 2))
     if not known.any():
         return None
+    least = inverse[inverse > 0].min()
     if image.camera not in _fits:
         # Rays of a very narrow view are all but one, but for the rounding of their squares.
         rays, precise = _blocks(image.rays), np.finfo(np.float64).eps ** 0.5
@@ -59,7 +60,7 @@ def encoding(image: RangeImage) -> float | None:
     # What is rougher than most, as where surfaces meet, is no part of a plane.
     rough = noise / inverse.max(axis=(1, 2)) ** 2
     flat = rough <= CLEARLY * quantile(rough, 0.5)
-    values = inverse.min() * (1 / inverse[flat]).mean(axis=(1, 2))
+    values = least * (1 / inverse[flat]).mean(axis=(1, 2))
     # Real planes differ by more than their noise tells.
     share, variance = share[flat], (noise / square)[flat] + SPREAD**2
     off = np.log1p((share - 1 / (1 - _Q[:, None] * values)) ** 2 / variance)
@@ -80,8 +81,7 @@ def decoded(image: RangeImage, q: float) -> RangeImage:
     return replace(image, inverse=inverse.astype(np.float32))
 
 
-# Rays of blocks (N, S, 3), and what makes of inverse depths along them the planes (N, 3, S) of
-# least squares; of a camera, as long as it lives.
+# Rays (N, S, 3) of the blocks of a camera, as long as it lives, and their pseudo-inverses.
 _fits: WeakKeyDictionary[Camera, tuple[NDArray[np.float64], ...]] = WeakKeyDictionary()
 
 
