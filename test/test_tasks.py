@@ -55,10 +55,10 @@ class LosesSignals:
     folder: Path
 
     def run(self):
-        if (self.folder / 'put away').exists():
+        if (self.folder / 'begun').exists():
             return
-        (self.folder / 'begun').touch()
         with suppress(SystemExit):
+            (self.folder / 'begun').touch()
             time.sleep(600)
         try:
             time.sleep(600)
@@ -96,6 +96,7 @@ def test_a_worker_that_loses_a_signal_ends_where_another_dies(tmp_path):
     # A result first: the pool waits for a worker just started only from its next result on.
     tasks = [LosesSignals(tmp_path), Square(2), DiesOnceBegun(tmp_path)]
     assert [type(result) for result in attempt_all(tasks, 2)] == [type(None), int, Failure]
+    assert (tmp_path / 'put away').exists()
 
 
 def test_results_come_in_order_whatever_workers_die(tmp_path):
