@@ -30,11 +30,11 @@ def test_a_managed_node_works_while_it_is_active():
         service = '/managed/segment_planes/change_state'
         client = bench.node.create_client(ChangeState, service)
 
-        def change(kind):
+        def change(kind, success=True):
             bench.until(client.service_is_ready)
             future = client.call_async(ChangeState.Request(transition=Transition(id=kind)))
             bench.until(future.done)
-            assert future.result().success
+            assert future.result().success == success
 
         def subscribed():
             return bench.node.count_subscribers('/managed/depth/image_rect')
@@ -42,11 +42,15 @@ def test_a_managed_node_works_while_it_is_active():
         with bench.listening('labels'):
             bench.spin(1.0)
             assert not subscribed()
+            change(Transition.TRANSITION_ACTIVATE, success=False)
             change(Transition.TRANSITION_CONFIGURE)
-            change(Transition.TRANSITION_ACTIVATE)
-            bench.until(subscribed)
-            change(Transition.TRANSITION_DEACTIVATE)
-            bench.until(lambda: not subscribed())
+            change(Transition.TRANSITION_CONFIGURE, success=False)
+            bench.until(lambda: 'transition refused' in bench.log())
+            for end in Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVE_SHUTDOWN:
+                change(Transition.TRANSITION_ACTIVATE)
+                bench.until(subscribed)
+                change(end)
+                bench.until(lambda: not subscribed())
 
 
 def test_two_nodes_in_one_process():

@@ -77,26 +77,32 @@ for arguments in eval(sys.argv[1]):
 """
 
 
-def test_bad_arguments_end_with_one_line():
-    run = python(EACH_IN_A_FORK, repr([*BAD.values()]))
-    assert run.stdout.split() == ['2'] * len(BAD), run.stderr
-    for line, words in zip(run.stderr.splitlines(), BAD, strict=True):
+def test_bad_arguments_end_with_one_line(tmp_path):
+    own = tmp_path / 'own.yaml'
+    own.write_text('ns:\n  segment_planes:\n    ros__parameters: {smothness: 3.0}\n')
+    file = '--ros-args', '-r', '__ns:=/ns', '--params-file', os.fspath(own)
+    bad = {**BAD, "is 'smoothness' meant?": file}
+    run = python(EACH_IN_A_FORK, repr([*bad.values()]))
+    assert run.stdout.split() == ['2'] * len(bad), run.stderr
+    for line, words in zip(run.stderr.splitlines(), bad, strict=True):
         assert line.startswith('segment_planes: ') and words in line
 
 
 def test_it_starts_with_a_shared_file_and_no_place_for_log_files_and_warns_of_both(tmp_path):
     shared = tmp_path / 'shared.yaml'
     shared.write_text(
-        '/**:\n  ros__parameters:\n    of_another: 1\n    min_pixels: 7\n'
+        '/**:\n  ros__parameters:\n    odom_frame: odom\n    min_pixels: 7\n'
         '    qos_overrides: {/scan: {subscription: {depth: -1}}}\n'
+        '    start_type_description_service: false\n'
     )
     command = ['/usr/bin/env', 'ROS_LOG_DIR=/proc/none', *NODE]
     with Bench('--params-file', os.fspath(shared), command=command, namespace='shared') as bench:
         said = 'will subscribe', '/proc/none cannot be written to'
         bench.until(lambda: all(part in bench.log() for part in said))
         assert bench.log().count(said[1]) == 1
-        for name in ('of_another', 'qos_overrides./scan.subscription.depth'):
-            assert f"unknown parameter '{name}'" in bench.log()
+        assert "unknown parameter 'odom_frame'; is 'odometry_frame' meant?" in bench.log()
+        assert "'qos_overrides./scan.subscription.depth' is of another topic" in bench.log()
+        assert bench.log().count('ignored') == 2
 
 
 def test_help_names_every_parameter():

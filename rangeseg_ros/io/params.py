@@ -13,10 +13,11 @@ from rangeseg_ros.io.corrections import check_corrections
 from rangeseg_ros.io.yaml_files import read_yaml
 
 NODE = 'segment_planes'
+OF_EVERY_NODE = 'use_sim_time', 'start_type_description_service'
 # Parameters that the node has beyond those of the segmenter; nested ones by their first part.
 NODE_ONLY = frozenset(
     {'input', 'raw', 'use_imu', 'managed', 'target_rate', 'stall_timeout', 'qos_overrides'}
-    | {'use_sim_time'}
+    | set(OF_EVERY_NODE)
 )
 
 
@@ -47,6 +48,15 @@ def read_params(path: Path) -> dict[str, Any]:
             warnings.warn(f'{path}: left out {", ".join(sorted(map(str, foreign)))}', stacklevel=2)
         merged.update({name: value for name, value in own.items() if name not in foreign})
     return merged
+
+
+def names_of_node(path: Path, node: str) -> set[str]:
+    """Parameters that a ROS parameter file has for a node by its name; none where it is broken."""
+    try:
+        sections = _sections(path, read_yaml(path) or {})
+        return {str(name) for own, section in sections if own == node for name in section}
+    except ValueError:
+        return set()
 
 
 def _sections(path: Path, content: dict[Any, Any]) -> Iterator[tuple[str, dict[Any, Any]]]:

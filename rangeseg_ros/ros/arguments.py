@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import sys
 from dataclasses import fields
@@ -13,6 +14,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.utilities import remove_ros_args
 
 from rangeseg_ros.core.options import ConfigError, unknown_parameter
+from rangeseg_ros.io.params import OF_EVERY_NODE, names_of_node
 from rangeseg_ros.kernel_cache import writable
 from rangeseg_ros.messages.outputs import MAP_OUTPUTS, OUTPUTS
 from rangeseg_ros.ros.depth_input import input_topics
@@ -32,8 +34,6 @@ Find the planes in depth images: the ROS 2 node. Some ROS arguments:
 Parameters:
 """
 
-# Of rclpy and of every node.
-_FOREIGN = ('use_sim_time', 'start_type_description_service')
 _OVERRIDING = QoSOverridingOptions.with_default_policies()
 _POLICIES = {'reliability': ReliabilityPolicy, 'history': HistoryPolicy}
 
@@ -56,26 +56,27 @@ def check_arguments(arguments: list[str]) -> None:
 def check_parameters(node: Node, arguments: list[str]) -> None:
     """Refuse parameters that the node does not have, so that none is misspelt in silence.
 
-    Those of a parameter file may be meant for other nodes, and `qos_overrides` for other topics:
-    they are warned of, unless they look like one of this node. ConfigError names what is refused,
-    also a quality of service that there is none of.
+    Those that a parameter file has for nodes of any name may be meant for others, and
+    `qos_overrides` for other topics: they are warned of. ConfigError names what is refused, also a
+    quality of service that there is none of.
     """
     quality = _quality_parameters(node)
     for name in sorted(quality & set(node._parameter_overrides)):
         _check_policy(name, node._parameter_overrides[name].value)
     known = {field.name for field in fields(NodeConfig)} | quality
-    given = [name for name in node._parameter_overrides if name.partition('.')[0] not in _FOREIGN]
-    unknown = sorted(set(given) - known)
-    alone = {argument.partition(':=')[0].rpartition(':')[2] for argument in arguments}
+    unknown = sorted(set(node._parameter_overrides) - known - set(OF_EVERY_NODE))
+    own = {argument.partition(':=')[0].rpartition(':')[2] for argument in arguments}
+    for option, file in itertools.pairwise(arguments):
+        own |= names_of_node(Path(file), node.get_name()) if option == '--params-file' else set()
     topics = {name.split('.')[1] for name in quality}
     for name in unknown:
-        problem = unknown_parameter(name, known)
+        problem = unknown_parameter(name, known | set(OF_EVERY_NODE))
         # `ros2 param dump` writes those of the topics that a node had, maybe under other names.
         foreign = name.startswith('qos_overrides.') and name.split('.')[1] not in topics
-        if not foreign and (name in alone or 'meant' in problem):
+        if not foreign and name in own:
             raise ConfigError(problem)
-        where = 'of another topic' if foreign else 'of another node'
-        node.get_logger().warning(f'{problem} ({where}?), ignored')
+        problem = f'{name!r} is of another topic' if foreign else f'{problem} (of another node?)'
+        node.get_logger().warning(f'{problem}, ignored')
 
 
 def logging_arguments() -> list[str]:

@@ -14,6 +14,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from rangeseg_ros.core.sensing.camera import CameraError
 from rangeseg_ros.messages.cameras import camera_from_message, raw_by_name
 from rangeseg_ros.messages.frames import DepthFrame
+from rangeseg_ros.messages.images import PIXEL_TYPES
 from rangeseg_ros.messages.make import nanoseconds
 from rangeseg_ros.ros.counting import Losses
 from rangeseg_ros.ros.pairing import StampPairing
@@ -122,7 +123,9 @@ class DepthInput:
         (info,) = self._infos
         found = self._cameras.find(nanoseconds(message.header.stamp))
         if found is None:
-            if not self._cameras.by_stamp:
+            if (encoding := getattr(message, 'encoding', 'mono16')) not in PIXEL_TYPES:
+                self._warn(f'encoding {encoding!r} is no depth image')
+            elif not self._cameras.by_stamp:
                 self._warn(f'no camera_info on {info.topic} yet')
             return
         try:

@@ -142,7 +142,7 @@ class FrameStatistics:
             'reason for no planes': found.reason if found else '',
             'sensor': str(found.sensor) if found else '',
             'work_budget': f'{found.work_budget:g}' if found else '1',
-            'ground': str(known.get('ground', '')),
+            'ground': str(known.get('ground') or ''),
             'stairs': ', '.join(map(str, known.get('stairs', ()))),
         }
         if self.times:

@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.srv import ChangeState
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.exceptions import (
@@ -81,6 +82,8 @@ class SegmentPlanes(LifecycleNode):
         # A clock that stands still, of a simulation or a recording, must not silence the reports.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(1.0, self._look_around, clock=steady)
+        (self._manager,) = (s for s in self.services if s.service_name.endswith('/change_state'))
+        self._change_state, self._manager.callback = self._manager.callback, self._on_transition
         # What follows a change of parameters is done by the executor, as are all subscriptions.
         self._changed = self.create_guard_condition(self._configure)
         self._settings = Settings(config, self._on_compiling, self._changed.trigger)
@@ -114,6 +117,20 @@ class SegmentPlanes(LifecycleNode):
         self._active = False
         self._follow_demand()
         return TransitionCallbackReturn.SUCCESS
+
+    on_shutdown = on_deactivate
+
+    def _on_transition(
+        self, request: ChangeState.Request, response: ChangeState.Response
+    ) -> ChangeState.Response:
+        """Refuse transitions that the state does not have: rclpy would end the process."""
+        try:
+            answer: ChangeState.Response = self._change_state(request, response)
+            return answer
+        except RuntimeError as error:
+            self.get_logger().warning(f'transition refused: {str(error).split(", at ")[0]}')
+            response.success = False
+            return response
 
     def stop(self, patience: float) -> bool:
         """Let the frame in hand be finished; False when it takes more seconds than that."""

@@ -101,7 +101,9 @@ def bind(node: Node, apply: Callable[[NodeConfig], None]) -> NodeConfig:
 def _descriptor(declared: Field[Any]) -> ParameterDescriptor:
     """Description and range of a `Config` field."""
     metadata = declared.metadata
-    descriptor = ParameterDescriptor(description=metadata['description'])
+    # Read at the start alone.
+    fixed = declared.name == 'managed'
+    descriptor = ParameterDescriptor(description=metadata['description'], read_only=fixed)
     if metadata['choices']:
         descriptor.additional_constraints = f'one of {", ".join(metadata["choices"])}'
     low, high = metadata['low'], metadata['high']
