@@ -57,17 +57,16 @@ class PlaneGrid:
     def _measure(self) -> None:
         """Count cells where the plane is, as most planes of a map do not change."""
         # Surely: seen three times, or as much oftener.
-        self._counts = np.array(
-            [np.count_nonzero(self.odds > 0), np.count_nonzero(self.odds >= SURE)]
-        )
+        self._there = int(np.count_nonzero(self.odds > 0))
+        self._sure = int(np.count_nonzero(self.odds >= SURE))
 
     @property
     def area(self) -> float:
-        return float(self._counts[0]) * self.side**2
+        return self._there * self.side**2
 
     @property
     def sure_area(self) -> float:
-        return float(self._counts[1]) * self.side**2
+        return self._sure * self.side**2
 
     def centres(self, chosen: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
         """Centres (K, 2) of the cells where the plane is, or of those chosen (V, U)."""
@@ -105,11 +104,12 @@ class PlaneGrid:
     def add(self, cells: NDArray[np.bool_], change: float) -> None:
         """Take in a look, `HIT` or `MISS`, at cells (V, U)."""
         if cells.any():
-            before = self._counts
+            there, sure = self._there, self._sure
             self.odds[cells] = np.clip(self.odds[cells] + change, LEAST, _MOST)
             self._measure()
             if self._whole:
-                self._whole._counts += self._counts - before
+                self._whole._there += self._there - there
+                self._whole._sure += self._sure - sure
 
     def part(self, start: NDArray[np.intp], end: NDArray[np.intp]) -> PlaneGrid:
         """The cells from the column and row `start` (2,) to before `end` (2,), shared."""

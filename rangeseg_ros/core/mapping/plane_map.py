@@ -90,6 +90,9 @@ class PlaneMap:
     def __len__(self) -> int:
         return sum(map(self._told, self._records))
 
+    def __repr__(self) -> str:
+        return f'<PlaneMap of {len(self)} planes>'
+
     @property
     def doubts(self) -> list[str]:
         """What the planes say against the poses: jumps, by the stamps of their frames."""
@@ -219,21 +222,21 @@ class PlaneMap:
     ) -> None:
         """Take in the cells of planes of the map that a frame finds, and those it sees through."""
         camera, grids = image.camera, [record.grid for record in self._records]
-        seen = self._filters.moved(pose.inverse(), np.zeros(3), np.diag(noise.deviations**2))
+        known = self._filters.planes.moved(pose.inverse())
         parts: dict[int, list[Plane]] = {}
         for plane, k in zip(planes, match.tolist(), strict=True):
             parts.setdefault(k, []).append(plane)
         for k, some in parts.items():
             corners = np.concatenate([corners_of(part) for part in some])
-            grids[k].reach(seen.planes.where([k]).coordinates(corners))
+            grids[k].reach(known.where([k]).coordinates(corners))
         # Through a lens, or in a cloud, no homography leads from cells to pixels.
         pinhole = camera if camera and not camera.distortion_model else None
-        looked_at = in_sight(grids, seen.planes, image) if camera else {}
+        looked_at = in_sight(grids, known, image) if camera else {}
         if not pinhole:
             looked_at = {k: grids[k] for k in looked_at | parts}
         others, centres, points = {}, [np.zeros((0, 2))], [np.zeros((0, 3))]
         for k, grid in looked_at.items():
-            own, found = seen.planes.where([k]), np.zeros(grid.odds.shape, np.bool_)
+            own, found = known.where([k]), np.zeros(grid.odds.shape, np.bool_)
             if pinhole:
                 for part in parts.get(k, []):
                     found |= seen_cells(grid, own, part, labels, pinhole)
@@ -248,7 +251,9 @@ class PlaneMap:
             grid.add(found, HIT)
         if not camera:
             return
-        owner = np.repeat(list(others), [len(own) for own in centres[1:]]).astype(np.intp)
+        errors = np.zeros(3), np.diag(noise.deviations**2)
+        seen = self._filters.where([*others]).moved(pose.inverse(), *errors)
+        owner = np.repeat(range(len(others)), [len(own) for own in centres[1:]]).astype(np.intp)
         at, sensor = np.concatenate(centres), SensorModel.from_config(self.config)
         passed = passed_through(
             np.concatenate(points),
@@ -294,10 +299,10 @@ class PlaneMap:
     def _forget(self) -> None:
         """Drop planes of which nothing is left, clutter out of sight, and what is too much."""
         trial = self._time - 1e9 * self.config.track_time
-        kept = [r.grid.area > 0 and (self._told(r) or r.seen >= trial) for r in self._records]
+        kept = [self._told(r) or (r.seen >= trial and r.grid.area > 0) for r in self._records]
         # Those out of sight the longest are forgotten first, and of these the ones hardly seen.
-        rank = [(-r.seen, -r.observations) for r in self._records]
-        order = sorted(np.flatnonzero(kept).tolist(), key=rank.__getitem__)
-        chosen = np.zeros(len(kept), np.bool_)
-        chosen[order[: self.config.map_planes]] = True
-        self._keep(chosen)
+        if sum(kept) > self.config.map_planes:
+            rank = [(k, r.seen, r.observations) for k, r in zip(kept, self._records, strict=True)]
+            order = sorted(range(len(rank)), key=rank.__getitem__, reverse=True)
+            kept = np.isin(range(len(rank)), order[: self.config.map_planes]).tolist()
+        self._keep(np.array(kept, np.bool_))
