@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from rangeseg_ros.core.sensing.camera import Camera, CameraError
     from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
     from rangeseg_ros.core.sequence import SequenceSegmenter
+    from rangeseg_ros.extras import MissingExtraError
     from rangeseg_ros.io.cameras import camera_from_calibration
     from rangeseg_ros.io.corrections import corrected
     from rangeseg_ros.messages.cameras import camera_from_matrices
@@ -28,6 +29,7 @@ __all__ = [
     'CameraError',
     'Config',
     'ConfigError',
+    'MissingExtraError',
     'Plane',
     'RangeImage',
     'RangeImageError',
@@ -55,6 +57,7 @@ _HOMES = {
     'core.sensing.camera': ('Camera', 'CameraError'),
     'core.sensing.range_image': ('RangeImage', 'RangeImageError'),
     'core.sequence': ('SequenceSegmenter',),
+    'extras': ('MissingExtraError',),
     'io.cameras': ('camera_from_calibration',),
     'io.corrections': ('corrected',),
     'messages.cameras': ('camera_from_matrices',),

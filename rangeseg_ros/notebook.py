@@ -34,7 +34,7 @@ def segment(
 
     Parameters
     ----------
-    depth : (H, W) integers of 8 to 32 bits or floats, or (H, W, 3) float
+    depth : (H, W) integers or floats, or (H, W, 3) float
         Depth along the optical axis, see `RangeImage.from_depth`; without a camera points in
         metres, see `RangeImage.from_points`.
     camera : Camera, optional

@@ -35,11 +35,13 @@ def test_one_call_gives_what_the_segmenter_gives(seen, result):
 
 
 def test_texts_are_short(seen, result):
-    for thing in (result, result.planes[0], result.image, Segmenter(Config(noise=0.001))):
+    sequence = rangeseg_ros.SequenceSegmenter(Config(noise=0.001))
+    parts = result.ground, result.grid, result.survey, result.labelling
+    for thing in (result, result.planes[0], result.image, sequence, sequence.map, *parts):
         assert 10 < len(repr(thing)) < 200
     walls = sum(plane.role == 'wall' for plane in result.planes)
     assert f'{len(result.planes)} planes (' in repr(result) and f'wall {walls}' in repr(result)
-    assert 'noise=0.001' in repr(Segmenter(Config(noise=0.001))) and 'default' in repr(Segmenter())
+    assert repr(Segmenter(Config(noise=0.001))) == 'Segmenter(Config(noise=0.001))'
     assert 'nothing' in repr(RangeImage.from_depth(np.zeros((480, 640)), seen.camera))
 
 
@@ -81,8 +83,9 @@ def test_errors_have_a_suggestion(seen, monkeypatch):
         (lambda: Config(smothness=3), ConfigError, "'smoothness' meant"),
         (lambda: rangeseg_ros.segment(depth, camera, smothness=3), ConfigError, 'smoothness'),
         (lambda: Segmenter().segment(depth), ValueError, r'RangeImage.from_depth\(depth, camera'),
+        (lambda: Segmenter({'noise': 0.001}), ConfigError, r'must be a Config\(...\), not {'),
         (lambda: RangeImage.from_depth(depth, (525, 525)), ValueError, r'a Camera\(width'),
-        (lambda: rangeseg_ros.segment(depth), ValueError, r'\(H, W, 3\)'),
+        (lambda: rangeseg_ros.segment(depth), ValueError, 'a depth image needs its camera'),
         (lambda: Camera.from_fov(640, 480, 180), CameraError, 'between 0 and 180'),
         (lambda: import_extra('pandas'), MissingExtraError, r"install 'rangeseg_ros\[notebook\]'"),
     ):

@@ -161,12 +161,13 @@ def test_eight_bits_have_no_unit_but_the_stated_one():
 @pytest.mark.parametrize(
     ('depth', 'scale', 'message'),
     [
-        (np.zeros((3, 4, 3), np.uint16), None, 'one channel'),
-        (np.zeros((3, 4), np.int64), None, 'floats, not int64'),
+        (np.zeros((3, 4, 1), np.uint16), None, r'\(H, W\), not \(3, 4, 1\)'),
+        ('depth.png', None, r"\(H, W\), not 'depth.png'"),
         (np.zeros((3, 4), bool), None, 'floats, not bool'),
         (np.zeros((4, 4), np.uint16), None, '4x4'),
         (np.zeros((3, 4), np.uint16), 0.0, 'scale'),
         (np.zeros((3, 4), np.uint16), np.nan, 'scale'),
+        (np.zeros((3, 4), np.uint16), 'mm', "number, not 'mm'"),
     ],
 )
 def test_refused_depth_images(depth, scale, message):

@@ -16,7 +16,7 @@ VGA = 640 * 480
 """Pixels of the image that numbers of pixels are meant for; others show things as much larger."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Config:
     """Parameters of `Segmenter`; the defaults suit a Kinect-style sensor.
 
@@ -201,6 +201,13 @@ class Config:
             raise ConfigError('parameter odometry_frame must have a name')
         if self.up_x == self.up_y == self.up_z == 0:
             raise ConfigError('parameters up_x, up_y, up_z must not all be 0')
+
+    def __repr__(self) -> str:
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        changed = (
+            f'{f.name}={values[f.name]!r}' for f in fields(self) if values[f.name] != f.default
+        )
+        return f'{type(self).__name__}({", ".join(changed)})'
 
     @property
     def level(self) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.noise import measured_sensor, quantisation
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.ground.survey import Survey
+from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.regions import least_pixels, numbers_of, plane_regions, relabel
 from rangeseg_ros.core.runtime.kernels import with_kernels
 from rangeseg_ros.core.runtime.threads import Task
@@ -57,15 +58,12 @@ class Segmenter:
     """
 
     def __init__(self, config: Config | None = None) -> None:
-        self.config = config or Config()
+        self.config = Config() if config is None else config
+        if not isinstance(self.config, Config):
+            raise ConfigError(f'config must be a Config(...), not {config!r:.60}')
 
     def __repr__(self) -> str:
-        changed = (
-            f'{f.name}={value!r}'
-            for f in fields(self.config)
-            if (value := getattr(self.config, f.name)) != f.default
-        )
-        return f'<Segmenter {", ".join(changed) or "with default parameters"}>'
+        return f'Segmenter({self.config!r})'
 
     def segment(self, image: RangeImage) -> Segmentation:
         """Label every pixel of `image` with the plane it belongs to.

@@ -57,6 +57,9 @@ class SequenceSegmenter:
         self._stamp = 0
         self._pose: Transform | None = None
 
+    def __repr__(self) -> str:
+        return f'<SequenceSegmenter, {self.config!r}, {self.map!r}>'
+
     @property
     def config(self) -> Config:
         """Parameters; new ones count from the next frame on, and the planes keep their ids."""
@@ -134,7 +137,7 @@ class SequenceSegmenter:
             self.motion = found.of_origin(image.place)
             if not config.fixed_frame:
                 if not found.held and len(self.map):
-                    self.map = self.map.anew('no plane held the camera')
+                    self.map = self.map.anew('the odometry lost the camera')
                 pose = self.motion.pose.after(sensor)
         self.pose = pose.after(sensor.inverse()) if pose else None
         if pose:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,8 @@ from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
 
-class Labelling(NamedTuple):
+@dataclass(frozen=True, eq=False, repr=False)
+class Labelling:
     """Discretised normals as labels of the pixels of an image."""
 
     labels: NDArray[np.int32]  # (H, W), indices of directions

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,8 @@ from rangeseg_ros.core.graphcut.expansion import energy
 from rangeseg_ros.core.sensing.grid import View
 
 
-class Labelling(NamedTuple):
+@dataclass(frozen=True, eq=False, repr=False)
+class Labelling:
     """Planes, those of `models`, as labels (H, W) of the pixels of an image; 0 is no plane."""
 
     labels: NDArray[np.int32]

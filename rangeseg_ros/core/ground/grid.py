@@ -55,6 +55,11 @@ class GroundGrid(NamedTuple):
     orientation: NDArray[np.float64]
     frame: str
 
+    def __repr__(self) -> str:
+        return (
+            f'<GroundGrid {len(self.classes)}x{len(self.classes)}, {self.resolution:g} m a cell>'
+        )
+
 
 def empty_grid() -> GroundGrid:
     """The grid of an image whose ground is not looked for."""

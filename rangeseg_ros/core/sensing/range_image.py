@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -74,7 +75,7 @@ class RangeImage:
 
         Parameters
         ----------
-        depth : (H, W) integers of 8 to 32 bits or floats, of either byte order
+        depth : (H, W) integers or floats, of either byte order
             Depth along the optical axis; 0, negative values and 65535 (integers), non-finite or
             <= 0 (floats) and what the mask of a masked array hides are invalid.
         camera : Camera
@@ -96,14 +97,16 @@ class RangeImage:
         """
         array, hidden = _unmasked(depth)
         if array.ndim != 2:
-            raise RangeImageError(f'depth image must have one channel, not shape {array.shape}')
+            given = array.shape if array.ndim else f'{depth!r:.60}'
+            raise RangeImageError(f'depth image must be of shape (H, W), not {given}')
         if not isinstance(camera, Camera):
             raise RangeImageError(
-                f'camera must be a Camera(width, height, fx, fy, cx, cy), not {camera!r:.60}'
+                'camera must be a Camera(width, height, fx, fy, cx, cy) or of '
+                f'camera_from_matrices(...), not of type {type(camera).__name__}'
             )
-        integers = array.dtype.kind in 'iu' and array.itemsize <= 4
+        integers = array.dtype.kind in 'iu'
         if not integers and array.dtype.kind != 'f':
-            raise RangeImageError(f'depth has 8 to 32 bits or is of floats, not {array.dtype}')
+            raise RangeImageError(f'depth must be of integers or floats, not {array.dtype}')
         height, width = array.shape
         if array.shape != camera.shape:
             raise RangeImageError(
@@ -113,8 +116,8 @@ class RangeImage:
             scale = 0.001 if integers else 1.0
             if array.itemsize == 1:
                 warnings.warn('depth of 8 bits has no unit', UnitWarning, stacklevel=2)
-        if not (np.isfinite(scale) and scale > 0):
-            raise RangeImageError(f'depth scale must be positive, not {scale}')
+        if not (isinstance(scale, Real) and np.isfinite(scale) and scale > 0):
+            raise RangeImageError(f'depth scale must be a positive number, not {scale!r}')
         if integers and array.dtype != np.uint16:
             # Older readers of 16-bit images give wider integers; those of 32 bits may be finer.
             array = np.where(array == NOT_MEASURED, 0, array)
@@ -157,8 +160,9 @@ class RangeImage:
         """
         array, hidden = _unmasked(points)
         if array.ndim != 3 or array.shape[2] != 3 or array.dtype.kind != 'f' or not array.size:
+            hint = '; a depth image needs its camera' if array.ndim == 2 else ''
             raise RangeImageError(
-                f'organised cloud must be (H, W, 3) float, not {array.shape} {array.dtype}'
+                f'organised cloud must be (H, W, 3) float, not {array.shape} {array.dtype}{hint}'
             )
         x, y, z = array[..., 0], array[..., 1], array[..., 2]
         with np.errstate(invalid='ignore', over='ignore'):
