@@ -93,8 +93,7 @@ with suppress(ImportError):
 
 
 # What only some commands and functions need; rangeseg_ros/extras.py names them where missing.
-bags = ['rosbags>=0.11.9,<0.12']
-report = ['jinja2>=3.0', 'matplotlib>=3.6']
+bags = ['rosbags>=0.11.9,<0.12', 'jinja2>=3.0', 'matplotlib>=3.6']
 
 setup(
     name=package_name,
@@ -154,24 +153,27 @@ setup(
         # PyMaxflow is what the minimum cuts are compared with, mcap what the bags are read by.
         'test': [
             *bags,
-            *report,
+            'OpenEXR>=3.3',
             'PyMaxflow>=1.3',
             'ezdxf>=1.1',
             'hypothesis>=6.90',
             'mcap>=1.2.1',
             'pandas>=2.0',
+            'pypcd4>=1.2',
             'pytest>=7.4',
             'pytest-timeout>=2.2',
             'pytest-xdist>=3.3',
             'trimesh>=4.0',
         ],
         'bags': bags,
-        'report': [*bags, *report],
+        # The name that it had with the reports of recordings.
+        'report': bags,
         'notebook': ['matplotlib>=3.6', 'pandas>=2.0', 'trimesh>=4.0'],
         'open3d': ['open3d>=0.18'],
         'exr': ['OpenEXR>=3.3'],
+        'pcd': ['pypcd4>=1.2'],
         'dask': ['distributed>=2023.1'],
-        'plan': [*bags, *report, 'ezdxf>=1.1', 'trimesh>=4.0'],
+        'plan': [*bags, 'ezdxf>=1.1', 'trimesh>=4.0'],
         'docs': ['mkdocs-material>=9.5', 'mkdocstrings[python]>=0.26'],
         'lint': ['import-linter>=2.1', 'mypy>=1.8', 'ruff>=0.4', 'types-PyYAML'],
         # The node where no ROS 2 is installed: rclpy over Fast DDS as wheels. A sourced ROS 2 has

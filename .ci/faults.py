@@ -185,8 +185,8 @@ def damaged_recordings():
 def declared_sizes():
     shape = b"{'descr': '<u2', 'fortran_order': False, 'shape': (99999999, 99999999), }"
     Path('a.npy').write_bytes(b'\x93NUMPY\x01\x00v\x00' + shape.ljust(117) + b'\n')
-    fields = 'FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 999999999\nHEIGHT 999999\nDATA binary\n'
-    Path('a.pcd').write_text(fields)
+    fields = 'FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 999999999\nHEIGHT 999999\n'
+    Path('a.pcd').write_text(fields + 'POINTS 999998999000001\nDATA binary\n')
     Path('a.ply').write_text('ply\nformat ascii 1.0\nelement vertex 99999999999\nend_header\n')
     png = Path('wall.png').read_bytes()
     Path('a.png').write_bytes(png[:16] + b'\x7f\xff\xff\xff' * 2 + png[24:])

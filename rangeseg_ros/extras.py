@@ -7,12 +7,14 @@ from types import ModuleType
 
 EXTRAS = {
     'rosbags': 'bags',
-    'jinja2': 'report',
-    'matplotlib': 'report',
+    'ezdxf': 'plan',
+    'jinja2': 'bags',
+    'matplotlib': 'notebook',
     'pandas': 'notebook',
     'trimesh': 'notebook',
     'open3d': 'open3d',
     'OpenEXR': 'exr',
+    'pypcd4': 'pcd',
     'distributed': 'dask',
     'rclpy': 'jazzy',
 }

@@ -26,7 +26,7 @@ from rangeseg_ros.evaluation.label_files import (
     read_label_image,
 )
 from rangeseg_ros.io.cameras import read_camera
-from rangeseg_ros.io.files import FileError, natural_order
+from rangeseg_ros.io.files import natural_order
 from rangeseg_ros.io.images import read_depth
 from rangeseg_ros.io.pcd import read_pcd
 from rangeseg_ros.segcomp import (
@@ -104,12 +104,8 @@ def read_depth_case(
 
 def read_scan(image: Path, truth: Path) -> Sample:
     """Organised laser scan of the SynPEB kind: x forward, z up, `intensity` >= 10 the plane."""
-    fields = read_pcd(image)
-    missing = {'x', 'y', 'z', 'intensity'} - fields.keys()
-    if missing:
-        raise FileError(f'{image}: no field {", ".join(sorted(missing))}')
     # Such scans count their columns from right to left.
-    x, y, z, label = (fields[name][:, ::-1] for name in ('x', 'y', 'z', 'intensity'))
+    x, y, z, label = np.moveaxis(read_pcd(image, *'xyz', 'intensity')[:, ::-1], 2, 0)
     seen = RangeImage.from_points(np.stack([-y, -z, x], axis=2).astype(np.float64))
     planar = np.isfinite(label) & (label >= FIRST_REGION)
     labels = np.where(planar, label, 0).astype(np.uint16)

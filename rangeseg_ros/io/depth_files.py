@@ -6,6 +6,7 @@ import zipfile
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,12 +89,14 @@ def read_frame(path: Path, intrinsics: Intrinsics, scale: float | None = None) -
     """
     suffix = path.suffix.lower()
     known = intrinsics.camera.shape if intrinsics.camera else None
+    array: NDArray[Any]
     if suffix == '.pcd':
-        array = _read_pcd(path, known)
+        points = read_pcd(path, *'xyz')
+        array = organised(points[0], known, path) if len(points) == 1 else points
     elif suffix == '.ply':
         array = read_ply(path, known)
     elif suffix in ('.npy', '.npz'):
-        array = _read_numpy(path)
+        array = _read_numpy(path, known)
     elif suffix == '.exr':
         array = _read_exr(path)
     elif suffix == '.bag':
@@ -105,34 +108,25 @@ def read_frame(path: Path, intrinsics: Intrinsics, scale: float | None = None) -
     return RangeImage.from_depth(array, intrinsics.of(array.shape), scale)
 
 
-def _read_pcd(path: Path, shape: tuple[int, int] | None) -> NDArray[np.floating]:
-    fields = read_pcd(path)
+def _read_numpy(path: Path, shape: tuple[int, int] | None) -> NDArray:
     try:
-        points = np.stack([fields[axis].astype(np.float32) for axis in 'xyz'], axis=-1)
-    except KeyError as error:
-        raise FileError(f'{path}: no field {error} in it') from None
-    return organised(points[0], shape, path) if points.shape[0] == 1 else points
-
-
-def _read_numpy(path: Path) -> NDArray:
-    try:
-        content = np.load(path, allow_pickle=False)
-        if isinstance(content, np.ndarray):
-            return content
-        with content:
-            name = 'depth' if 'depth' in content.files else content.files[0]
-            return np.asarray(content[name])
+        array = np.load(path, allow_pickle=False)
+        if not isinstance(array, np.ndarray):
+            with array as arrays:
+                array = arrays['depth' if 'depth' in arrays.files else arrays.files[0]]
     except (OSError, ValueError, EOFError, IndexError, zipfile.BadZipFile):
         raise FileError(f'{path}: not a readable file of NumPy') from None
+    if array.ndim not in (2, 3):
+        raise FileError(f'{path}: neither (H, W) nor (H, W, 3), but {array.shape}')
+    return organised(array, shape, path) if array.shape[1:] == (3,) else array
 
 
 def _read_exr(path: Path) -> NDArray[np.float32]:
     try:
-        channels = import_extra('OpenEXR').File(str(path)).channels()
-        # Grey images have Y, renderers write Z or V; others repeat it in R, G and B.
-        (name, *_) = [
-            name for name in ('Z', 'Y', 'V', 'depth', 'R', *channels) if name in channels
-        ]
-        return np.asarray(channels[name].pixels, np.float32)
+        channels = import_extra('OpenEXR').File(str(path), separate_channels=True).channels()
+        # Renderers write Z or V, maybe of a layer; grey images have Y, or R, G and B alike.
+        last = {name.rpartition('.')[2]: name for name in channels}
+        kind = next(kind for kind in (*'ZVYR', 'depth', *last) if kind in last)
+        return np.asarray(channels[last[kind]].pixels, np.float32)
     except (RuntimeError, ValueError, OSError):
         raise FileError(f'{path}: not a readable EXR file') from None
