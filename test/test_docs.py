@@ -97,8 +97,9 @@ def test_the_tutorial_can_be_followed(tmp_path, monkeypatch):
     pyplot.switch_backend('agg')
     monkeypatch.chdir(tmp_path)
     text = (ROOT / 'docs/tutorial.md').read_text()
-    settings = re.findall(r'^    (up_.*)$', text, re.M)
-    Path('up.yaml').write_text('\n'.join(settings))
+    Path('up.yaml').write_text(
+        '\n'.join(re.findall(r'^    (.*(?:segment_planes:|up_.*))$', text, re.M))
+    )
     for words in shown_commands('docs/tutorial.md'):
         run(words)
     (code,) = re.findall(r'```python\n(.*?)```', text, re.S)

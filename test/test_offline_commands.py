@@ -44,6 +44,16 @@ def test_segment_writes_labels_overlay_and_planes(folder, run):
     assert cv2.imread('out/here/2_overlay.png').shape == (48, 64, 3)
 
 
+def test_segment_goes_on_after_a_bad_file_and_leaves_its_own_results_out(folder, run):
+    (folder / 'depth' / '3.png').write_text('no image')
+    segment = 'segment', 'depth', *CAMERA, '--output', 'depth'
+    code, output, error = run(*segment)
+    assert code == 2 and re.fullmatch(r'rangeseg: depth/3.png: .*\n', error)
+    assert re.findall(r'^depth/(\d+).png: ', output, re.M) == ['2', '10']
+    (folder / 'depth' / '3.png').unlink()
+    assert run(*segment, '--overwrite') == (0, output, '')
+
+
 def test_segment_says_what_the_sensor_errs_by(folder, run):
     depth = 1500 + np.random.default_rng(0).normal(0, 4, (48, 64))
     write_image(folder / 'depth' / '3.png', np.rint(depth).astype(np.uint16))

@@ -53,7 +53,7 @@ class _LazyGroup(click.Group):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         # Without a command what there is, and no error.
-        return super().parse_args(ctx, args or ['--help'])
+        return super().parse_args(ctx, args if args not in ([], ['help']) else ['--help'])
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section('Commands'):

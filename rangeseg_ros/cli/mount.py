@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import click
@@ -36,7 +37,9 @@ def command(ctx: click.Context, recording: Path, base: str, config: Config) -> N
     still = Placement(pose=Transform.identity())
     frames, name = 0, ''
     with DepthBag(recording) as source:
-        for _, frame, _, _ in segment_frames(source, sequence, lambda frame: still):
+        for _, frame, _, _ in segment_frames(
+            source, sequence, lambda frame: still, partial(options.progress, unit='frame')
+        ):
             frames, name = frames + 1, frame.frame_id
     mount = mount_of(sequence.map.planes, frames, sequence.config.role_tolerance)
     if mount is None:

@@ -245,6 +245,12 @@ def progress(items: Iterable[T], total: int, unit: str) -> Iterable[T]:
             interrupts.check()
 
 
+def say(text: str, err: bool = False) -> None:
+    """Print a line, above the bar of `progress`."""
+    with tqdm.external_write_mode():
+        click.echo(text, err=err)
+
+
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
     """Make a folder that appears under its name once it is complete."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import click
 
 from rangeseg_ros.batch.plan import PlanOutcome, PlanTask
 from rangeseg_ros.cli import options, recordings
+from rangeseg_ros.extras import import_extra
 from rangeseg_ros.tasks import Failure
 
 
@@ -59,9 +59,8 @@ def command(
     --fixed-frame in that which the tf of the recording moves in, without tf in the odometry of the
     planes. Walls are made exactly square where their covariances allow it.
     """
-    missing = [name for name in ('ezdxf', 'trimesh') if find_spec(name) is None]
-    if missing:
-        raise click.ClickException(f'{" and ".join(missing)} missing: install the extra plan')
+    for library in ('ezdxf', 'trimesh'):
+        import_extra(library)
     tasks = [
         PlanTask(path, folder, **settings)
         for path, folder in recordings.with_folders(paths, output, scheduler)

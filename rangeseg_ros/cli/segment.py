@@ -9,12 +9,10 @@ import click
 
 from rangeseg_ros.batch.frame_files import FRAME_FILES, frame_path, write_frame
 from rangeseg_ros.cli import options
+from rangeseg_ros.cli.errors import one_line
 from rangeseg_ros.compilation.preparation import prepare, show
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
-from rangeseg_ros.core.sensing.camera import CameraError
-from rangeseg_ros.core.sensing.distortion import DistortionError
-from rangeseg_ros.core.sensing.range_image import RangeImageError
 from rangeseg_ros.core.sequence import with_roles
 from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.io.depth_files import CLOUDS, Intrinsics, files_in, read_frame, scale_of
@@ -44,7 +42,9 @@ _SHOWN = ('labels', 'planes', 'overlay', 'normals', 'terrain', 'stairs')
 @click.option(
     '--sensor', is_flag=True, help='Also print the errors of the sensor as every image shows them.'
 )
+@click.pass_context
 def command(
+    ctx: click.Context,
     depth: tuple[Path, ...],
     intrinsics: Intrinsics,
     output: Path,
@@ -65,6 +65,9 @@ def command(
     <stem>_stairs.csv. Nothing that is there already is replaced, unless --overwrite says so.
     """
     frames = [(file, depth_scale or scale_of(path)) for path in depth for file in files_in(path)]
+    # A folder may have the results of an earlier run beside its images.
+    made = {frame_path(path.parent, path.stem, kind) for path, _ in frames for kind in FRAME_FILES}
+    frames = [(path, scale) for path, scale in frames if path in depth or path not in made]
     options.check_distinct((path.stem for path, _ in frames), 'images')
     segmenter = Segmenter(config)
     files = [name for name in FRAME_FILES if asked.get(name, True)]
@@ -73,26 +76,31 @@ def command(
     clouds = any(path.suffix.lower() in CLOUDS for path, _ in frames)
     kinds = ('image', 'points') if clouds else ('image',)
     prepare(config, kinds, show, _SHOWN)
-    tilted = 0
+    tilted = refused = 0
     for path, scale in options.progress(frames, len(frames), 'image'):
         try:
             image = corrected(read_frame(path, intrinsics, scale), config)
-        except (RangeImageError, CameraError, DistortionError) as error:
-            raise click.ClickException(f'{path}: {error}') from None
+        except (ValueError, OSError) as error:
+            named = '' if str(path) in one_line(error) else f'{path}: '
+            options.say(f'rangeseg: {named}{one_line(error)}', err=True)
+            refused += 1
+            continue
         result = segmenter.segment(image)
         result = replace(result, planes=with_roles(result.planes, config, result.up))
         write_frame(output, path.stem, image, result, files)
         if result.planes:
-            click.echo(f'{path}: {len(result.planes)} planes, {result.ground or "in no unit"}')
+            options.say(f'{path}: {len(result.planes)} planes, {result.ground or "in no unit"}')
         else:
-            click.echo(f'{path}: no plane: {result.reason}')
+            options.say(f'{path}: no plane: {result.reason}')
         if not result.verdict.ok:
-            click.echo(f'rangeseg: {path}: {result.verdict}', err=True)
+            options.say(f'rangeseg: {path}: {result.verdict}', err=True)
         if result.tilt:
             tilted += 1
             if tilted == 1:
-                click.echo(f'rangeseg: {path}: {result.tilt}', err=True)
+                options.say(f'rangeseg: {path}: {result.tilt}', err=True)
         if sensor:
-            click.echo(f'{path}: {result.sensor}')
+            options.say(f'{path}: {result.sensor}')
     if tilted > 1:
         click.echo(f'rangeseg: the stated up is off in {tilted} images', err=True)
+    if refused:
+        ctx.exit(2)

@@ -40,5 +40,7 @@ def read_yaml(path: Path) -> Any:
     except RecursionError:
         raise FileError(f'{path}: nested too deeply or too often') from None
     # Not of YAML alone: dates and numbers raise errors of Python.
-    except (ValueError, OverflowError, yaml.YAMLError):
-        raise FileError(f'{path}: not a {"JSON" if json_file else "YAML"} file') from None
+    except (ValueError, OverflowError, yaml.YAMLError) as error:
+        mark = getattr(error, 'problem_mark', None)
+        where = f' from line {mark.line + 1} on' if mark else ''
+        raise FileError(f'{path}: not a {"JSON" if json_file else "YAML"} file{where}') from None
