@@ -73,12 +73,17 @@ class PlaneGrid:
         v, u = np.nonzero(self.odds > 0 if chosen is None else chosen)
         return np.asarray((np.stack([u, v], axis=1) + self.first + 0.5) * self.side, np.float64)
 
-    def distance(self, point: NDArray[np.float64]) -> float:
-        """From a point (2,) to the next cell where the plane is, metres; 0 inside."""
+    def distance(self, point: NDArray[np.float64], limit: float) -> float:
+        """From a point (2,) to the next cell where the plane is, metres; 0 inside.
+
+        Beyond the limit it may be infinity.
+        """
         (v,), (u,) = self.cells(point[None])
         height, width = self.odds.shape
         if 0 <= u < width and 0 <= v < height and self.odds[v, u] > 0:
             return 0.0
+        if max(-u, u - width, -v, v - height) * self.side > limit + self.side:
+            return np.inf
         return float(np.hypot(*(self.centres() - point).T).min(initial=np.inf))
 
     def cells(self, points: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -193,8 +198,8 @@ def in_sight(
     some = planes.where(crossed)
     at = (corners - some.point[:, None]) @ np.swapaxes(some.axes, 1, 2)
     known = [grids[k] for k in crossed.tolist()]
-    first = np.array([grid.first for grid in known]).reshape(-1, 2)
-    size = np.array([grid.odds.shape[::-1] for grid in known]).reshape(-1, 2)
+    first = np.concatenate([np.zeros(0, np.intp), *(grid.first for grid in known)]).reshape(-1, 2)
+    size = np.array([grid.odds.shape for grid in known]).reshape(-1, 2)[:, ::-1]
     side = np.array([grid.side for grid in known])[:, None]
     ends = np.floor(at.min(axis=1) / side), np.floor(at.max(axis=1) / side) + 1
     start, end = (np.clip(cell - first, 0, size).astype(np.intp) for cell in ends)

@@ -199,14 +199,16 @@ class PlaneMap:
         """Numbers (M,) of the planes of the map that the planes of a frame are, -1 for none."""
         index, which, value = self._filters.alike(seen.planes, seen.spread, camera)
         at = self._filters.planes.where(index).coordinates(seen.planes.point[which])
-        away = [self._records[k].grid.distance(p) for k, p in zip(index.tolist(), at, strict=True)]
+        far = np.array([np.hypot(*plane.extents) for plane in planes])[which]
+        pairs = zip(index.tolist(), at, far.tolist(), strict=True)
+        away = [self._records[k].grid.distance(p, limit) for k, p, limit in pairs]
         match = np.full(len(planes), -1)
         # What one frame finds on two surfaces is not one plane, however badly its pose is known.
         surface: dict[int, int] = {}
         # The one it lies on, or else the likeliest.
         for n in np.lexsort([value, np.array(away) > 0]).tolist():
             k, m = int(index[n]), int(which[n])
-            near = match[m] < 0 and away[n] <= np.hypot(*planes[m].extents)
+            near = match[m] < 0 and away[n] <= far[n]
             if near and surface.setdefault(k, planes[m].surface) == planes[m].surface:
                 match[m] = k
         return match
@@ -281,7 +283,7 @@ class PlaneMap:
             own = filters.planes.where([m]).points(b.grid.centres())
             centres = filters.planes.where([k]).coordinates(own)
             across = np.hypot(*b.grid.odds.shape) * b.grid.side
-            if not len(own) or a.grid.distance(centres.mean(axis=0)) > across:
+            if not len(own) or a.grid.distance(centres.mean(axis=0), across) > across:
                 continue
             a.grid.absorb(centres, b.grid.odds[b.grid.odds > 0])
             first, second = sorted((a.id, b.id))
@@ -299,7 +301,11 @@ class PlaneMap:
     def _forget(self) -> None:
         """Drop planes of which nothing is left, clutter out of sight, and what is too much."""
         trial = self._time - 1e9 * self.config.track_time
-        kept = [self._told(r) or (r.seen >= trial and r.grid.area > 0) for r in self._records]
+        least = self.config.map_area
+        kept = [
+            r.grid.sure_area > least or (r.seen >= trial and r.grid.area > 0)
+            for r in self._records
+        ]
         # Those out of sight the longest are forgotten first, and of these the ones hardly seen.
         if sum(kept) > self.config.map_planes:
             rank = [(k, r.seen, r.observations) for k, r in zip(kept, self._records, strict=True)]
