@@ -370,5 +370,17 @@ def test_a_grid_has_the_area_and_the_outline_of_what_was_seen():
 def test_a_sliver_between_cells_is_seen():
     grid = PlaneGrid(0.1)
     grid.add(grid.fill([[np.array([[0.01, 0.02], [0.05, 0.02], [0.05, 0.03]])]]), HIT)
-    assert grid.area == pytest.approx(0.01) and grid.distance(np.array([0.03, 0.02])) == 0
-    assert grid.distance(np.array([0.05, 1.05])) == pytest.approx(1.0)
+    assert grid.area == pytest.approx(0.01) and grid.distance(np.array([0.03, 0.02]), 0.0) == 0
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_distances_up_to_their_limit_are_those_of_all_cells(seed):
+    random = np.random.default_rng(seed)
+    grid = PlaneGrid(0.1)
+    grid.add(grid.fill([[random.uniform(-1, 1, 2) + np.eye(3)[:, :2]]]), HIT)
+    for point in random.uniform(-3, 3, (50, 2)):
+        nearest = np.linalg.norm(grid.centres() - point, axis=1).min()
+        for limit in nearest * 0.999, nearest, np.inf:
+            found = grid.distance(point, limit)
+            assert found in (0, pytest.approx(nearest)) or (found == np.inf and limit < nearest)
+            assert found > 0 or nearest <= grid.side * 0.5**0.5
