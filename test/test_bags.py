@@ -8,13 +8,15 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from message_classes import cloud
 from recordings import SUFFIXES, Recording, depth_images, record
 
 from rangeseg_ros.core.sensing.camera import Camera, CameraWarning
 from rangeseg_ros.io.bag_writer import DepthBagWriter
-from rangeseg_ros.io.bags import DamagedBagError, DepthBag
+from rangeseg_ros.io.bags import DamagedBagError, DepthBag, open_frames
 from rangeseg_ros.io.cameras import read_camera, write_camera
 from rangeseg_ros.io.recordings import BagError
+from rangeseg_ros.messages.make import CLOUD
 
 STORAGES = tuple(SUFFIXES)
 
@@ -438,3 +440,28 @@ def test_sizes_are_checked_before_pngs_are_decoded(tmp_path, monkeypatch):
     _, bag = numbers_of(tmp_path / 'bag')
     assert 'depth image is 3000x3000, its camera_info 64x48' in bag.loss()
     assert len(set(decoded)) == 1
+
+
+def test_clouds_are_taken_where_there_are_no_images_and_one_topic_or_the_one_that_is_named(
+    tmp_path,
+):
+    recording = Recording()
+    for number, topics in enumerate(('/a', '/a /b', '/a /b image')):
+        for n, topic in enumerate(topics.split()):
+            if topic == 'image':
+                recording.add_image(10 + n, depth_images(1)[0])
+                recording.add_camera(10 + n)
+            else:
+                message = cloud(np.full((3, 4, 3), 1 + n, '<f4'))
+                recording.messages.append((10 + n, topic, CLOUD, message))
+        recording.write(tmp_path / f'{number}')
+        recording.messages.clear()
+    with open_frames(tmp_path / '0', None, None) as bag:
+        assert next(iter(bag)).range_image().points[0, 0] == pytest.approx([1, 1, 1])
+    with pytest.raises(BagError, match='several topics of point clouds: /a, /b'):
+        open_frames(tmp_path / '1', None, None)
+    for number in '12':
+        with open_frames(tmp_path / number, '/b', None) as bag:
+            assert next(iter(bag)).range_image().points[0, 0] == pytest.approx([2, 2, 2])
+    with open_frames(tmp_path / '2', None, None) as bag:
+        assert next(iter(bag)).camera is not None
