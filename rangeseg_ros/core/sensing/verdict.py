@@ -92,10 +92,12 @@ def judge(
             f'More than half of the image is beyond {FAR:.0f} m: the values are not in metres.'
         )
     elif factor := improbable_scale(image):
-        times = f'{factor:g} times too far' if factor > 1 else f'{1 / factor:g} times too near'
+        hint, times = ' (TUM: 0.0002)', f'{factor:g} times too far'
+        if factor < 1:
+            hint, times = '', f'{1 / factor:g} times too near'
         found['scale improbable'] = (
             f'The steps of the depth are those of a Kinect whose image is read {times}: '
-            'check the depth scale (TUM: 0.0002).'
+            f'check the depth scale{hint}.'
         )
     # A range that is read as z bends all planes.
     if curved is None or 'range instead of z' in found:
