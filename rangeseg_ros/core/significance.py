@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 LEVEL = 0.999  # quantile that noise stays below: where it does not, something else is there
 OUTLIER = 4.0  # standard deviations from which an error is no noise: one of 16 000 by chance
 CLEARLY = 2.0  # how many times more must speak for one of two things than for the other
+CAUCHY = 2.385  # deviations at which errors count half: 95 % efficient (Holland and Welsch 1977)
 SAMPLES = 12  # that tell three parameters, those of a plane, or a quantile: four for each
 
 

@@ -30,9 +30,8 @@ from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
 from rangeseg_ros.core.calibration.sightings import Sightings
+from rangeseg_ros.core.significance import CAUCHY
 
-# Cauchy's constant: 95 % efficient for normal errors (Holland and Welsch 1977).
-_CAUCHY = 2.385
 # Relative error of the solution, far below its uncertainty, and iterations that always suffice.
 _TOLERANCE, _ITERATIONS = 1e-3, 1000
 # Added to the normal matrices, whose entries are numbers of cells: a row of cells is no plane.
@@ -101,7 +100,7 @@ def robust_weights(seen: Sightings, error: NDArray[np.float64] | float) -> NDArr
     middle = [max(float(np.median(part)), typical) for part in np.split(size, seen.start[1:-1])]
     spread = 1.4826 * np.array(middle)[seen.plane()]
     weight: NDArray[np.float64] = (1.4826 * typical / spread) ** 2
-    weight /= 1 + (residual / (_CAUCHY * spread)) ** 2
+    weight /= 1 + (residual / (CAUCHY * spread)) ** 2
     return weight
 
 

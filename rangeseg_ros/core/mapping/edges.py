@@ -16,11 +16,11 @@ from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.enlargement import Cells
 from rangeseg_ros.core.sensing.grid import GridEdges
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.significance import chi2_quantile
+from rangeseg_ros.core.significance import CAUCHY, chi2_quantile
 
 # Points that tell the direction of an edge.
 _NEIGHBOURS = 8
-# Points that err as one, as those along an edge do: so NEES is 1.2 in simulated rooms.
+# Points that err as one, as those along an edge do: so NEES is about 1 in simulated rooms.
 _TOGETHER = 32
 _ROUNDS, _GATE = 4, chi2_quantile(1)
 _DEVIATION = 1.4826  # of Gaussian errors, over their median absolute value
@@ -80,8 +80,9 @@ class JumpPoints(NamedTuple):
             origin = np.cross(last.points, then), across[place] @ back.rotation
             slope = np.hstack([*moved, *origin])
             expected = ((slope @ prior) * slope).sum(axis=1) + deviation**2
-            # Huber's weights, once it is known how the points scatter.
-            weight = np.minimum(1.0, limit / np.maximum(np.abs(gap), 1e-12))
+            # Cauchy's weights, once it is known how the points scatter: those that are hidden in
+            # one of the images have no counterpart.
+            weight = 1 / (1 + (gap / limit) ** 2)
             # As seen from the poses that were given.
             gap += slope @ error
             known = gap**2 < _GATE * expected
@@ -95,7 +96,7 @@ class JumpPoints(NamedTuple):
             left = np.abs(gap - slope @ error)[known]
             if len(left) > 2 * _NEIGHBOURS:
                 deviation = max(_DEVIATION * float(np.median(left)), least)
-            limit = _GATE**0.5 * deviation
+            limit = CAUCHY * deviation
         return design, values
 
     def _across(self, neighbours: NDArray[np.intp]) -> NDArray[np.float64]:

@@ -205,14 +205,14 @@ class PlaneOdometry:
             flat, gap, noise = np.concatenate(design[fits]), gap[fits], noise[fits]
             expected = flat @ self._covariance
             weight = value = np.ones(len(gap))
-            # Huber's weights: planes that move by themselves are not to move the camera.
+            # Cauchy's weights: planes that move by themselves are not to move the camera.
             for _ in range(_ROUNDS):
                 error = block_diag(*(noise / weight[:, None, None]))
                 gain = np.linalg.solve(expected @ flat.T + error, expected).T
                 step = gain @ gap.ravel()
                 # What the state leaves of the gaps.
                 value = mahalanobis(gap - (flat @ step).reshape(-1, 3), noise)
-                weight = np.minimum(1.0, np.sqrt(GATE / np.maximum(value, 1e-12)))
+                weight = 1 / (1 + value / 4)
             pose = self._corrected(pose, step, gain, flat, error)
             fits[fits] = value < GATE
         self._keep(fits)
