@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.estimate import HIGHEST
+from rangeseg_ros.core.runtime.threads import Task
 from rangeseg_ros.core.significance import CLEARLY, OUTLIER
 
 # Columns on either side whose ground leads to a cell.
@@ -34,7 +35,8 @@ def reach(
     that leads to a cell, and how much farther than the nearest ground in view a chain begins.
     """
     step, slope, radius = config.least_step, config.steepest, config.robot_radius
-    even = _without_steps(place, variance, step, slope)
+    across = Task(_without_steps, 1, place, variance, step, slope)
+    even = _without_steps(0, place, variance, step, slope) & across.result()
     reached = np.zeros(even.shape, np.bool_)
     if not even.any():
         return reached
@@ -56,7 +58,7 @@ def reach(
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def _without_steps(
-    place: NDArray[np.float64], variance: NDArray[np.float64], step: float, slope: float
+    axis: int, place: NDArray[np.float64], variance: NDArray[np.float64], step: float, slope: float
 ) -> NDArray[np.bool_]:
     """Measured cells (rows, columns) that are beside no step and on no slope along an axis.
 
@@ -66,39 +68,38 @@ def _without_steps(
     """
     _, rows, columns = place.shape
     even = variance > 0
-    for axis in range(2):
-        for e in range(_BASELINES):
-            down, right = (1 << e, 0) if axis == 0 else (0, 1 << e)
-            for i in range(rows - down):
-                for c in range(columns - right):
-                    k, m = i + down, c + right
-                    if not variance[i, c] * variance[k, m] > 0:
-                        continue
-                    up = place[0, k, m] - place[0, i, c]
-                    square = variance[i, c] + variance[k, m]
-                    if up * up < CLEARLY * CLEARLY * square:  # level, however far away
-                        continue
-                    x, y = place[1, k, m] - place[1, i, c], place[2, k, m] - place[2, i, c]
-                    way = np.sqrt(x * x + y * y)
-                    # Beyond an edge the ground is hidden: what is next is farther than it is deep.
-                    beside = e == 0 or way < step
-                    if beside and abs(up) > slope * way + OUTLIER * np.sqrt(square) + step / 8:
-                        even[i, c] = even[k, m] = False
-                    p, q = k + down, m + right
-                    if 2 * way < step or abs(up) <= slope * way or p >= rows or q >= columns:
-                        continue
-                    if not variance[p, q] > 0:
-                        continue
-                    total = place[0, p, q] - place[0, i, c]
-                    x, y = place[1, p, q] - place[1, k, m], place[2, p, q] - place[2, k, m]
-                    on = np.sqrt(x * x + y * y)
-                    if up * (total - up) <= 0 or abs(total - up) <= slope * on:
-                        continue
-                    noise = CLEARLY * np.sqrt(variance[i, c] + variance[p, q])
-                    if abs(total) > slope * (way + on) + noise:
-                        even[k, m] = False
-                        if abs(up - total * way / (way + on)) < noise:
-                            even[i, c] = even[p, q] = False
+    for e in range(_BASELINES):
+        down, right = (1 << e, 0) if axis == 0 else (0, 1 << e)
+        for i in range(rows - down):
+            for c in range(columns - right):
+                k, m = i + down, c + right
+                if not variance[i, c] * variance[k, m] > 0:
+                    continue
+                up = place[0, k, m] - place[0, i, c]
+                square = variance[i, c] + variance[k, m]
+                if up * up < CLEARLY * CLEARLY * square:  # level, however far away
+                    continue
+                x, y = place[1, k, m] - place[1, i, c], place[2, k, m] - place[2, i, c]
+                way = np.sqrt(x * x + y * y)
+                # Beyond an edge the ground is hidden: what is next is farther than it is deep.
+                beside = e == 0 or way < step
+                if beside and abs(up) > slope * way + OUTLIER * np.sqrt(square) + step / 8:
+                    even[i, c] = even[k, m] = False
+                p, q = k + down, m + right
+                if 2 * way < step or abs(up) <= slope * way or p >= rows or q >= columns:
+                    continue
+                if not variance[p, q] > 0:
+                    continue
+                total = place[0, p, q] - place[0, i, c]
+                x, y = place[1, p, q] - place[1, k, m], place[2, p, q] - place[2, k, m]
+                on = np.sqrt(x * x + y * y)
+                if up * (total - up) <= 0 or abs(total - up) <= slope * on:
+                    continue
+                noise = CLEARLY * np.sqrt(variance[i, c] + variance[p, q])
+                if abs(total) > slope * (way + on) + noise:
+                    even[k, m] = False
+                    if abs(up - total * way / (way + on)) < noise:
+                        even[i, c] = even[p, q] = False
     return even
 
 
