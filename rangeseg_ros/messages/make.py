@@ -38,8 +38,8 @@ def make_rclpy(kind: str, **fields: Any) -> Any:
     cls, octets = _class_and_octets(kind)
     for name, code in octets:
         if code:
-            # rclpy takes an array of bytes as it is, and a numpy array octet by octet.
-            data, fields[name] = fields[name], array(code)
+            # rclpy takes a numpy array octet by octet, and copies an array that it does not check.
+            data, fields[name], fields['check_fields'] = fields[name], array(code), True
             fields[name].frombytes(np.ascontiguousarray(data))
         else:
             fields[name] = bytes([fields[name]])

@@ -24,7 +24,10 @@ def points_of_class(image: RangeImage, terrain: Terrain, kind: int) -> NDArray[n
     where = np.flatnonzero(terrain.classes == kind)
     points = np.empty((len(where), 4), np.float32)
     rays, inverse = image.rays.reshape(-1, 3).take(where, axis=0), image.inverse.take(where)
-    points[:, :3] = rays / inverse[:, None] + image.place
+    # Axis by axis: broadcasting takes twice as long.
+    for k, shift in enumerate(image.place.astype(np.float32)):
+        np.divide(rays[:, k], inverse, out=points[:, k])
+        points[:, k] += shift
     points[:, 3] = terrain.height.take(where)
     return points
 
@@ -92,7 +95,7 @@ def _crossings(
     NaN where nothing was. Rays that do not cross the ground in front of the sensor are left out,
     and those for which its inverse range there is not within `bounds`, 1/m.
     """
-    rows, columns = np.nonzero(where)
+    rows, columns = np.divmod(np.flatnonzero(where), where.shape[1])
     points, inverse = _cross(rays, image, terrain, rows, columns)
     inside = (inverse > 0) & (inverse >= bounds[0]) & (inverse <= bounds[1])
     height = terrain.height[rows[inside], columns[inside]]

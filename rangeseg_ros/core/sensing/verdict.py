@@ -128,8 +128,10 @@ def filled_share(image: RangeImage) -> float:
         before, after = lines[:, :-1], lines[:, 1:]
         jumps = (before > 0) & (after > 0)
         jumps &= np.abs(before - after) > 0.05 * np.maximum(before, after)
-        ending = _runs(lines)[:, :-1][jumps]
-        beginning = _runs(lines[:, ::-1])[:, ::-1][:, 1:][jumps]
+        width = lines.shape[1]
+        rows, columns = np.divmod(np.flatnonzero(jumps), width - 1)
+        ending = _runs(lines, rows * width + columns)
+        beginning = _runs(lines[:, ::-1], rows * width + width - 2 - columns)
         short, long = sorted(
             (runs[runs > 3] for runs in (ending, beginning)), key=lambda runs: len(runs)
         )
@@ -139,12 +141,10 @@ def filled_share(image: RangeImage) -> float:
     return most
 
 
-def _runs(lines: NDArray[np.float32]) -> NDArray[np.int32]:
-    """How many pixels up to each one have its value."""
-    places = np.arange(lines.shape[1], dtype=np.int32)
-    begins = np.diff(lines, axis=1, prepend=np.float32(-1)) != 0
-    runs: NDArray[np.int32] = places - np.maximum.accumulate(places * begins, axis=1) + 1
-    return runs
+def _runs(lines: NDArray[np.float32], at: NDArray[np.intp]) -> NDArray[np.intp]:
+    """How many pixels up to each of those `at` (N,), in raster order, have its value."""
+    begins = np.flatnonzero(np.diff(lines, axis=1, prepend=np.float32(-1)))
+    return at - begins[np.searchsorted(begins, at, 'right') - 1] + 1
 
 
 def shows_range(
