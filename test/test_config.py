@@ -70,9 +70,9 @@ def test_any_mapping_gives_a_valid_config_or_a_config_error(mapping):
 def test_former_names_are_taken_with_a_warning():
     with pytest.warns(FutureWarning, match='warm_start is not read any more'):
         assert Config.from_mapping({'warm_start': True}) == Config()
-    with pytest.warns(FutureWarning, match='track_memory is called track_time now: track_time: 2'):
-        assert Config.from_mapping({'track_memory': 60}).track_time == 2.0
-    with pytest.warns(FutureWarning), pytest.raises(ConfigError, match='track_time'):
-        Config.from_mapping({'track_memory': 'long'})
+    with pytest.warns(FutureWarning, match='up_noise is called up_sd now: up_sd: 2.0'):
+        assert Config.from_mapping({'up_noise': 2.0}).up_sd == 2.0
+    with pytest.warns(FutureWarning), pytest.raises(ConfigError, match='up_sd'):
+        Config.from_mapping({'up_noise': 'long'})
     with pytest.warns(FutureWarning):
-        assert Config.from_mapping({'track_memory': 60, 'track_time': 1}).track_time == 1.0
+        assert Config.from_mapping({'up_noise': 2.0, 'up_sd': 1.0}).up_sd == 1.0

@@ -97,6 +97,8 @@ def test_what_is_none_is_refused_in_one_line(depth, tmp_path):
     np.savez(tmp_path / 'empty.npz')
     np.save(tmp_path / 'text2.npy', np.array([['a']]))
     np.save(tmp_path / 'row.npy', np.ones(5))
+    np.save(tmp_path / 'colour.npy', np.ones((4, 5, 3), np.uint8))
+    np.savez(tmp_path / 'first.npz', Depth=np.ones(5), colour=np.ones((4, 5)))
     np.save(tmp_path / 'points.npy', np.ones((5, 3)))
     for name, words in (
         ('unsized.ply', 'not an organised cloud'),
@@ -110,11 +112,22 @@ def test_what_is_none_is_refused_in_one_line(depth, tmp_path):
         ('record.bag', 'rangeseg replay'),
         ('missing.ply', 'No such file'),
         ('text2.npy', 'integers or floats, not <U1'),
-        ('row.npy', r'neither \(H, W\) nor'),
+        ('colour.npy', r'points \(H, W, 3\), \(4, 5, 3\) uint8'),
+        ('first.npz', r'\(5,\) float64'),
+        ('row.npy', r'no depth \(H, W\) nor points'),
         ('points.npy', '5 points, not an organised cloud'),
     ):
         with pytest.raises(ValueError, match=words):
             read_frame(tmp_path / name, Intrinsics(fov=60))
+
+
+def test_a_picture_in_exr_is_no_depth(depth, tmp_path):
+    exr = pytest.importorskip('OpenEXR')
+    header = {'compression': exr.ZIP_COMPRESSION, 'type': exr.scanlineimage}
+    with exr.File(header, {name: depth * np.float32(k) for k, name in enumerate('RGB')}) as file:
+        file.write(str(tmp_path / 'colour.exr'))
+    with pytest.raises(ValueError, match=r'which is depth\? Its channels: '):
+        read_frame(tmp_path / 'colour.exr', Intrinsics(CAMERA))
 
 
 def test_folders(depth, tmp_path):

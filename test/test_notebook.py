@@ -2,6 +2,7 @@
 
 import json
 import sys
+from functools import partial
 
 import matplotlib
 import numpy as np
@@ -78,6 +79,9 @@ def test_open3d(result):
 
 def test_errors_have_a_suggestion(seen, monkeypatch):
     depth, camera = seen.depth, seen.camera
+    sequence = partial(
+        rangeseg_ros.SequenceSegmenter().segment, RangeImage.from_depth(depth, camera)
+    )
     monkeypatch.setitem(sys.modules, 'pandas', None)
     for call, kind, words in (
         (lambda: Config(smothness=3), ConfigError, "'smoothness' meant"),
@@ -86,6 +90,13 @@ def test_errors_have_a_suggestion(seen, monkeypatch):
         (lambda: Segmenter({'noise': 0.001}), ConfigError, r'must be a Config\(...\), not {'),
         (lambda: RangeImage.from_depth(depth, (525, 525)), ValueError, r'a Camera\(width'),
         (lambda: rangeseg_ros.segment(depth), ValueError, 'a depth image needs its camera'),
+        (
+            lambda: rangeseg_ros.segment(seen.camera.rays, camera),
+            ValueError,
+            'points need no camera',
+        ),
+        (lambda: sequence(0, pose=np.eye(4)), ValueError, r'Transform.from_matrix\(matrix\)'),
+        (lambda: sequence(1.5), ValueError, 'an integer, nanoseconds, not 1.5'),
         (lambda: Camera.from_fov(640, 480, 180), CameraError, 'between 0 and 180'),
         (lambda: import_extra('pandas'), MissingExtraError, r"install 'rangeseg_ros\[notebook\]'"),
     ):

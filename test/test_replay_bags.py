@@ -135,15 +135,17 @@ def test_a_finished_recording_is_not_done_again(done, tmp_path):
     again = replay(path, out)
     assert (again.frames, again.notes, again.already_done) == (2, first.notes, True)
     assert (out / 'bag').stat().st_ino == bag
-    # Other parameters, other topics and another recording are other results.
-    assert not Replay(path, out, Config(min_pixels=499)).run().already_done
-    assert not replay(path, out).already_done
-    assert not replay(path, out, topics=('planes',)).already_done
+    # Other parameters, other topics and another recording are other results, not replaced unasked.
+    with pytest.raises(BagError, match='results of other input, parameters or code, not over'):
+        Replay(path, out, Config(min_pixels=499)).run()
+    assert not Replay(path, out, Config(min_pixels=499), overwrite=True).run().already_done
+    assert not replay(path, out, overwrite=True).already_done
+    assert not replay(path, out, overwrite=True, topics=('planes',)).already_done
     os.utime(next(path.glob('*.mcap')), ns=(0, 0))
-    assert not replay(path, out, topics=('planes',)).already_done
+    assert not replay(path, out, overwrite=True, topics=('planes',)).already_done
     # Frames of a longer recording do not stay behind.
-    assert replay(done / 'recording', out).frames == 4
-    assert replay(path, out).frames == 2
+    assert replay(done / 'recording', out, overwrite=True).frames == 4
+    assert replay(path, out, overwrite=True).frames == 2
     assert len(list(out.glob('*.png'))) == 4
 
 
@@ -207,7 +209,7 @@ def test_terrain_of_every_frame_is_that_of_the_messages(done):
     Replay(done / 'recording', lost, config, terrain=True).run()
     assert not any(read_labels(picture).any() for picture in lost.glob('*_terrain.png'))
     # Without terrain, none of it stays behind.
-    replay(done / 'recording', folder)
+    replay(done / 'recording', folder, overwrite=True)
     assert not list(folder.glob('*_terrain.png')) and not (folder / 'ground.csv').exists()
 
 

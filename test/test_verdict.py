@@ -316,3 +316,18 @@ def test_narrow_views_and_little_depth_tell_nothing_and_pass():
         camera = Camera(640, 480, focal, focal, 319.5, 239.5)
         depth = np.random.default_rng(1).uniform(least, most, camera.shape)
         assert encoding(RangeImage.from_depth(depth, camera)) is None
+
+
+@pytest.mark.parametrize('kind', ['uint16', 'floats', 'two values'])
+def test_noise_is_no_depth_and_nothing_is_nothing(kind):
+    random = np.random.default_rng(1)
+    camera = Camera.from_fov(320, 240, 57)
+    noise = {
+        'uint16': random.integers(500, 5000, camera.shape).astype(np.uint16),
+        'floats': random.random(camera.shape),
+        'two values': np.where(random.random(camera.shape) < 0.5, 1.0, 3.0),
+    }[kind]
+    verdict = Segmenter().segment(RangeImage.from_depth(noise, camera)).verdict
+    assert verdict.invalid and 'noise instead of depth' in verdict.reasons
+    verdict = Segmenter().segment(RangeImage.from_depth(0 * noise, camera)).verdict
+    assert verdict.reasons == ('nothing measured',) and not verdict.ok

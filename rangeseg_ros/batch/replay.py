@@ -29,6 +29,7 @@ from rangeseg_ros.io.bags import DamagedBagError, DepthBag
 from rangeseg_ros.io.corrections import corrected, correction_files
 from rangeseg_ros.io.meshes import write_mesh
 from rangeseg_ros.io.poses import write_trajectory
+from rangeseg_ros.io.recordings import BagError
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.report.replay import ReplayReport
 
@@ -94,8 +95,14 @@ class Replay:
         """Write the results, or find that they are there; BagError as `check`."""
         key, results_folder = self._key(), ResultFolder(self.folder)
         record = read_record(results_folder.bag)
-        if record.get('key') == key and results_folder.whole():
+        whole = results_folder.whole()
+        if whole and record.get('key') == key:
             return Outcome(**record['outcome'] | {'already_done': True})
+        if whole and not self.overwrite:
+            raise BagError(
+                f'{self.folder}: has results of other input, parameters or code, not overwritten '
+                '(see --overwrite)'
+            )
         self.check()
         with (
             results_folder.replacing() as made,
@@ -167,7 +174,8 @@ class _Results:
         files = write_frame(self.folder, stem, image, result, kinds)
         self.add_planes([*leading, *tables.values(plane)] for plane in result.planes)
         self.report.add(stamp, result, files['overlay'])
-        self.doubts.update(result.verdict.details)
+        if image.valid.any():
+            self.doubts.update(result.verdict.details)
         if result.tilt:
             self.tilts.append(result.tilt)
         if self.replay.terrain:

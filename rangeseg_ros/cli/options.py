@@ -141,7 +141,7 @@ def intrinsics(command: Callable[..., Any]) -> Any:
         any_number = any(number is not None for number in numbers)
         if (camera_file is not None) + any_number + (fov is not None) > 1:
             raise click.UsageError('give one of --camera, --fx ... --cy and --fov')
-        if any_number and not (numbers[0] or numbers[1]):
+        if any_number and numbers[0] is numbers[1] is None:
             raise click.UsageError('--cx and --cy need --fx')
         camera = read_camera(camera_file, raw) if camera_file else None
         known = Intrinsics(camera, numbers if any_number else (), fov)

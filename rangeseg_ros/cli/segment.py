@@ -92,7 +92,7 @@ def command(
             options.say(f'{path}: {len(result.planes)} planes, {result.ground or "in no unit"}')
         else:
             options.say(f'{path}: no plane: {result.reason}')
-        if not result.verdict.ok:
+        if not result.verdict.ok and image.valid.any():
             options.say(f'rangeseg: {path}: {result.verdict}', err=True)
         if result.tilt:
             tilted += 1
@@ -101,6 +101,6 @@ def command(
         if sensor:
             options.say(f'{path}: {result.sensor}')
     if tilted > 1:
-        click.echo(f'rangeseg: the stated up is off in {tilted} images', err=True)
+        click.echo(f'rangeseg: up is off in {tilted} images', err=True)
     if refused:
         ctx.exit(2)

@@ -256,11 +256,7 @@ def _check_names(kind: type[Config], names: Iterable[object]) -> None:
 
 
 # Former names of parameters, and their names now.
-RENAMED = {
-    'track_memory': 'track_time',
-    'sensor_height_noise': 'sensor_height_sd',
-    'up_noise': 'up_sd',
-}
+RENAMED = {'sensor_height_noise': 'sensor_height_sd', 'up_noise': 'up_sd'}
 # Former parameters that nothing reads any more, and why.
 DROPPED = {
     'directions': 'one kind is as good as another',
@@ -269,13 +265,13 @@ DROPPED = {
     'noise_regions': 'min_pixels leaves out what is small',
     'moves': 'exact expands labels: swaps take as long and leave a higher energy',
     'refits': 'planes are fitted to the final labels',
+    'track_memory': 'track_time says it in seconds',
     'warm_start': 'no frame depends on those before',
 }
 
 
-def known_name(name: object) -> bool:
-    """Whether a parameter is, or was, called so."""
-    return name in (*RENAMED, *DROPPED, *Config.__dataclass_fields__)
+NAMES = frozenset((*RENAMED, *DROPPED, *Config.__dataclass_fields__))
+"""What parameters are, or were, called."""
 
 
 def _renamed(mapping: Mapping[str, Any]) -> dict[str, Any]:
@@ -285,10 +281,7 @@ def _renamed(mapping: Mapping[str, Any]) -> dict[str, Any]:
     said = [f'{former} is not read any more: {reason}' for former, reason in dropped.items()]
     for former, name in RENAMED.items():
         if former in mapping:
-            value = mapping[former]
-            if former == 'track_memory' and isinstance(value, int | float):
-                value /= 30  # frames at 30 Hz
-            result.setdefault(name, value)
+            result.setdefault(name, mapping[former])
             said.append(f'{former} is called {name} now: {name}: {result[name]!r}')
     for text in said:
         warnings.warn(f'parameter {text}', FutureWarning, stacklevel=3)

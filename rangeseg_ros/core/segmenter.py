@@ -214,5 +214,5 @@ def _reason(image: RangeImage, planes: list[Plane]) -> str:
     if planes:
         return ''
     if not image.valid.any():
-        return 'no valid depth'
+        return 'no valid depth' if image.body is None else 'no valid depth outside the mask'
     return 'no flat region large enough'

@@ -18,7 +18,7 @@ from rangeseg_ros.core.mapping.map_planes import moved_planes
 from rangeseg_ros.core.mapping.observations import views
 from rangeseg_ros.core.mapping.odometry import Motion, PlaneOdometry
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
-from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.mapping.transforms import Transform, TransformError
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -108,7 +108,16 @@ class SequenceSegmenter:
             Standard deviation of `up`, degrees, where it is not the parameter `up_sd`.
         result : Segmentation, optional
             Of a `Segmenter` for `image`, as where it works on several frames at once.
+
+        Raises
+        ------
+        ValueError
+            A stamp that is no integer, a pose that is no Transform, or as `Segmenter.segment`.
         """
+        if not isinstance(stamp, int | np.integer):
+            raise ValueError(f'stamp must be an integer, nanoseconds, not {stamp!r:.60}')
+        if not isinstance(pose, Transform | None):
+            raise TransformError('pose must be a Transform, as of Transform.from_matrix(matrix)')
         result = result or self._segmenter.segment(image)
         config = self.config
         if up_sd not in (None, config.up_sd):

@@ -76,8 +76,8 @@ class Intrinsics:
                 'or --fx, --fy, --cx and --cy'
             )
         fx, fy, cx, cy = self.focal
-        fx, fy = fx or fy, fy or fx
-        assert fx and fy
+        fx, fy = fy if fx is None else fx, fx if fy is None else fy
+        assert fx is not None and fy is not None
         cx, cy = (width - 1) / 2 if cx is None else cx, (height - 1) / 2 if cy is None else cy
         return Camera(width, height, fx, fy, cx, cy)
 
@@ -113,20 +113,25 @@ def _read_numpy(path: Path, shape: tuple[int, int] | None) -> NDArray:
         array = np.load(path, allow_pickle=False)
         if not isinstance(array, np.ndarray):
             with array as arrays:
-                array = arrays['depth' if 'depth' in arrays.files else arrays.files[0]]
+                names = {name.lower(): name for name in arrays.files}
+                array = arrays[names.get('depth', arrays.files[0])]
     except (OSError, ValueError, EOFError, IndexError, zipfile.BadZipFile):
         raise FileError(f'{path}: not a readable file of NumPy') from None
-    if array.ndim not in (2, 3):
-        raise FileError(f'{path}: neither (H, W) nor (H, W, 3), but {array.shape}')
+    if array.ndim != 2 and (array.ndim != 3 or array.dtype.kind != 'f'):
+        raise FileError(
+            f'{path}: no depth (H, W) nor points (H, W, 3), {array.shape} {array.dtype}'
+        )
     return organised(array, shape, path) if array.shape[1:] == (3,) else array
 
 
 def _read_exr(path: Path) -> NDArray[np.float32]:
     try:
         channels = import_extra('OpenEXR').File(str(path), separate_channels=True).channels()
-        # Renderers write Z or V, maybe of a layer; grey images have Y, or R, G and B alike.
-        last = {name.rpartition('.')[2]: name for name in channels}
-        kind = next(kind for kind in (*'ZVYR', 'depth', *last) if kind in last)
-        return np.asarray(channels[last[kind]].pixels, np.float32)
     except (RuntimeError, ValueError, OSError):
         raise FileError(f'{path}: not a readable EXR file') from None
+    # Renderers write Z or V, maybe of a layer; grey images have Y, or R, G and B alike.
+    last = {name.rpartition('.')[2]: np.asarray(channels[name].pixels) for name in channels}
+    kinds = [kind for kind in ('Z', 'V', 'Y', 'depth') if kind in last] or sorted({*last} - {'A'})
+    if len(kinds) > 1 and any(not np.array_equal(last[kinds[0]], last[k]) for k in kinds):
+        raise FileError(f'{path}: which is depth? Its channels: {", ".join(channels)}')
+    return last[kinds[0]].astype(np.float32)

@@ -76,7 +76,7 @@ def _read(path: Path, shape: tuple[int, int] | None = None) -> NDArray:
     except cv2.error:
         image = None
     if image is None:
-        raise FileError(f'{path}: not a readable image (PNG or TIFF)')
+        raise FileError(f'{path}: not a readable PNG, or TIFF of 8 or 16 bits or float32')
     if pages > 1:
         warnings.warn(f'{path}: only the first of {pages} pages is read', stacklevel=3)
     return image

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from rangeseg_ros.core.config import Config, known_name
-from rangeseg_ros.core.options import ConfigError
+from rangeseg_ros.core.config import NAMES, Config
+from rangeseg_ros.core.options import ConfigError, unknown_parameter
 from rangeseg_ros.io.corrections import check_corrections
 from rangeseg_ros.io.yaml_files import read_yaml
 
@@ -43,9 +43,10 @@ def read_params(path: Path) -> dict[str, Any]:
     merged: dict[str, Any] = {}
     for node, section in sections:
         own = _without_node_only(section)
-        foreign = [name for name in own if node != NODE and not known_name(name)]
+        foreign = [name for name in own if node != NODE and name not in NAMES]
         if foreign:
-            warnings.warn(f'{path}: left out {", ".join(sorted(map(str, foreign)))}', stacklevel=2)
+            told = ', '.join(sorted(unknown_parameter(name, NAMES) for name in foreign))
+            warnings.warn(f'{path}: {told} (of another node?), ignored', stacklevel=2)
         merged.update({name: value for name, value in own.items() if name not in foreign})
     return merged
 

@@ -33,7 +33,7 @@ def read_ply(path: Path, shape: tuple[int, int] | None = None) -> NDArray[np.flo
     element = re.search(r'element vertex (\d+)\s+((?:property .*\s+)+)', header)
     order = re.search(r'format (ascii|binary_little_endian|binary_big_endian)', header)
     if not element or not order or 'element' in header[: element.start()]:
-        raise FileError(f'{path}: no vertices at its begin')
+        raise FileError(f'{path}: no vertices at its beginning')
     fields = [line.split()[1:] for line in element[2].strip().splitlines()]
     if any(len(field) != 2 or field[0] not in _TYPES for field in fields):
         raise FileError(f'{path}: vertices with lists')
@@ -61,8 +61,6 @@ def organised(
 ) -> NDArray[np.floating]:
     """Points (N, 3) of a file as (H, W, 3); FileError unless N is H x W of a `shape` (H, W)."""
     if shape is None or len(points) != shape[0] * shape[1]:
-        raise FileError(
-            f'{path}: {len(points)} points, not an organised cloud of known width and height '
-            '(--camera tells them where no point was left out)'
-        )
+        known = f'the camera has {shape[1]}x{shape[0]}' if shape else 'no --camera tells its size'
+        raise FileError(f'{path}: {len(points)} points, not an organised cloud; {known}')
     return points.reshape(*shape, 3)

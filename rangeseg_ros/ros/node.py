@@ -127,8 +127,9 @@ class SegmentPlanes(LifecycleNode):
         try:
             answer: ChangeState.Response = self._change_state(request, response)
             return answer
-        except RuntimeError as error:
-            self.get_logger().warning(f'transition refused: {str(error).split(", at ")[0]}')
+        except RuntimeError:
+            told = f'transition refused: {request.transition} is none of this state'
+            self.get_logger().warning(told)
             response.success = False
             return response
 

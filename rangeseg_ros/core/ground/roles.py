@@ -163,8 +163,8 @@ class Tilt(NamedTuple):
         """What to do about it, in one line."""
         x, y, z = (f'{part:.3f}' for part in self.up)
         return (
-            f'the stated up is off by {self.degrees:.0f} degrees, so that roles and terrain are '
-            f'unreliable; the planes say up_x: {x}, up_y: {y}, up_z: {z}'
+            f'up as stated, or of a level camera, is off by {self.degrees:.0f} degrees, so that '
+            f'roles and terrain are unreliable; the planes say up_x: {x}, up_y: {y}, up_z: {z}'
         )
 
 

@@ -141,7 +141,7 @@ def _upright(
         # Without a height the ground is what the camera stands on: a table tells by its size.
         size = float(np.ptp(place[1:, reached], axis=1).max()) if seen else 0.0
         sure = size >= FURNITURE
-        reason = f'sensor_height is not stated, so a surface {size:.2f} m wide may be a table'
+        reason = f'what is seen below is {size:.2f} m wide and may be a table: state sensor_height'
     if seen is None or not sure:
         confidence = seen.confidence if seen and height_sd > 0 else 0.0
         stand = Stand(np.zeros(3), confidence, (reason,) if seen or height_sd > 0 else ())

@@ -98,7 +98,8 @@ class RangeImage:
         array, hidden = _unmasked(depth)
         if array.ndim != 2:
             given = array.shape if array.ndim else f'{depth!r:.60}'
-            raise RangeImageError(f'depth image must be of shape (H, W), not {given}')
+            hint = '; points need no camera' if array.shape[2:] == (3,) else ''
+            raise RangeImageError(f'depth image must be of shape (H, W), not {given}{hint}')
         if not isinstance(camera, Camera):
             raise RangeImageError(
                 'camera must be a Camera(width, height, fx, fy, cx, cy) or of '
@@ -115,7 +116,9 @@ class RangeImage:
         if scale is None:
             scale = 0.001 if integers else 1.0
             if array.itemsize == 1:
-                warnings.warn('depth of 8 bits has no unit', UnitWarning, stacklevel=2)
+                warnings.warn(
+                    'depth of 8 bits has no unit: state the scale', UnitWarning, stacklevel=2
+                )
         if not (isinstance(scale, Real) and np.isfinite(scale) and scale > 0):
             raise RangeImageError(f'depth scale must be a positive number, not {scale!r}')
         if integers and array.dtype != np.uint16:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.enlargement import SIGNIFICANT, enlargement
 from rangeseg_ros.core.sensing.range_image import FAR, RangeImage
-from rangeseg_ros.core.significance import quantile
+from rangeseg_ros.core.significance import OUTLIER, quantile
 
 ODDS = float(np.log(1e4))
 """Logarithm of the odds at which one reading of an image is believed and not the other."""
@@ -32,6 +32,7 @@ _INVALID = {
     'range instead of z',
     'scale improbable',
     'millimetres in floats',
+    'noise instead of depth',
 }
 
 
@@ -68,7 +69,13 @@ def judge(
     `curved` (H, W) is not 0 on surfaces that are smooth and no planes; `identified` is False where
     the image was to tell the errors of the sensor and does not.
     """
+    if not image.valid.any():
+        return Verdict(('nothing measured',), ('Nothing in the image is measured.',))
     found: dict[str, str] = {}
+    rows = image.inverse[::4]
+    both = (rows[:, 1:] > 0) & (rows[:, :-1] > 0)
+    if both.any() and OUTLIER * np.abs(np.diff(rows)[both]).mean() > np.median(rows[rows > 0]):
+        found['noise instead of depth'] = 'Neighbouring pixels have nothing in common.'
     if cells := enlargement(image):
         found[f'enlarged x {cells.factor}'] = (
             f'Each measurement fills {cells.factor} x {cells.factor} pixels: the image was '
@@ -89,7 +96,8 @@ def judge(
         )
     if image.beyond_reach:
         found['millimetres in floats'] = (
-            f'More than half of the image is beyond {FAR:.0f} m: the values are not in metres.'
+            f'More than half of the image is beyond {FAR:.0f} m: the values are not in metres '
+            '(scale 0.001?).'
         )
     elif factor := improbable_scale(image):
         hint, times = ' (TUM: 0.0002)', f'{factor:g} times too far'
@@ -107,7 +115,7 @@ def judge(
             'More pixels are on curved surfaces than on planes: a part of the planes may be '
             'curved, too.'
         )
-    if not identified and image.valid.any():
+    if not identified:
         found['distortion not identifiable'] = (
             'Too little of the image is flat to measure noise and distortion: those of the '
             'parameters are used.'
