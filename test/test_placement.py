@@ -172,6 +172,12 @@ def test_angles_and_height_are_within_their_errors(height, pitch, roll):
     stated = *np.radians([roll, pitch]), height
     error = np.abs(np.subtract([mount.roll, mount.pitch, mount.height], stated))
     assert (error < [np.radians(1), np.radians(1), 0.02]).all() and (error < 4 * mount.sigma).all()
+    # As what draws from the covariance of the floor scatter by.
+    floor = max(sequence.map.planes, key=lambda plane: -plane.normal[1] * plane.area)
+    mean, random = np.append(floor.normal, floor.distance), np.random.default_rng(0)
+    x, y, z, drawn = random.multivariate_normal(mean, floor.covariance, 20000).T
+    angles = np.arctan2(-x, -y), np.arcsin(-z / np.sqrt(x**2 + y**2 + z**2))
+    assert mount.sigma == pytest.approx(np.std([*angles, drawn], axis=1), rel=0.05)
     # The camera's place in the frame on the floor, x forward.
     truth = scene.poses[0].rotation
     np.testing.assert_allclose(mount.rotation, truth, atol=0.03)
