@@ -136,7 +136,7 @@ def told(grid: GroundGrid, home: Transform, side: float) -> list[float]:
     ]
 
 
-def hour(sensor: Sensor, seed: int, minutes: int = 60) -> None:
+def hour(sensor: Sensor, seed: int) -> None:
     """Drive to and fro before an edge, with stated poses that err anew in every image."""
     there = [*driven(seed)]
     poses, images = [*there, *there[20::-1]], []
@@ -147,7 +147,7 @@ def hour(sensor: Sensor, seed: int, minutes: int = 60) -> None:
     draw, sequence, rows = np.random.default_rng([seed, 1]), SequenceSegmenter(config), []
     mounted = Rotation.from_euler('xyz', [1, -1, 1], degrees=True)
     sigma = [*3 * [np.radians(config.pose_turn_noise)], *3 * [config.pose_noise]]
-    for k in range(300 * minutes):
+    for k in range(300 * 60):
         pose, (depth, up) = poses[k % len(poses)], images[k % len(poses)]
         at = Transform(pose.rotation, pose.position).by(draw.normal(0, sigma))
         begun, image = time.process_time(), RangeImage.from_depth(depth, sensor.camera)

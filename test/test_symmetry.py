@@ -147,8 +147,8 @@ def test_a_mirror_swaps_left_and_right(kind):
         result = Segmenter(Config(**axes, sensor_height=height)).segment(
             RangeImage.from_depth(seen, rays)
         )
-        found.append((result.terrain[:, ::side], result.height[:, ::side], result.grid.classes))
-        found[-1] += ([str(stairs) for stairs in result.stairs],)
+        pictures = result.terrain[:, ::side], result.height[:, ::side], result.grid.classes
+        found.append((*pictures, list(map(str, result.stairs))))
     (classes, heights, grid, stairs), (others, other_heights, other_grid, other_stairs) = found
     # Where a surface ends, rounding decides which side a few pixels are on.
     assert (classes != others).mean() < 1e-3

@@ -25,7 +25,7 @@ _SIDE, _SAMPLES = 48, 8
 _Q = 1 - 2.0 ** np.arange(3, -4.1, -0.25)
 # A disparity has no q to fit: what that explains must be more than chance.
 _CHANCE = chi2_quantile(1) / 2
-# Metres, about what indoor cameras see; for 1.5 to 4 of them planes of pictures are found alike.
+# Metres, about what indoor cameras see; for 2 to 4 of them as many planes of pictures are found.
 _USUAL = 2.0
 
 
@@ -75,7 +75,7 @@ def encoding(image: RangeImage) -> float | None:
 def decoded(image: RangeImage, q: float) -> RangeImage:
     """The image of distances that the values stand for, but for a factor."""
     values = np.divide(1, image.inverse, out=np.zeros(image.shape), where=image.valid)
-    values /= max(values.max(initial=0), 1e-300)
+    values /= values.max()
     inverse = 1 / (1 - q * values) * image.valid if q else values
     inverse /= _USUAL * np.median(inverse[image.valid])
     return replace(image, inverse=inverse.astype(np.float32))
