@@ -63,8 +63,8 @@ def _without_steps(
     """Measured cells (rows, columns) that are beside no step and on no slope along an axis.
 
     A step is between cells side by side, whatever they are, so that the foot of a wall is none of
-    the ground. A slope rises or falls twice in three cells; where they lie on a line, all three
-    are on it, else the middle one.
+    the ground; one that is blurred over two cells leaves the cell between. A slope rises or falls
+    twice in three cells; where they lie on a line, all three are on it, else the middle one.
     """
     _, rows, columns = place.shape
     even = variance > 0
@@ -77,7 +77,7 @@ def _without_steps(
                     continue
                 up = place[0, k, m] - place[0, i, c]
                 square = variance[i, c] + variance[k, m]
-                if up * up < CLEARLY * CLEARLY * square:  # level, however far away
+                if e > 0 and up * up < CLEARLY * CLEARLY * square:  # level, however far away
                     continue
                 x, y = place[1, k, m] - place[1, i, c], place[2, k, m] - place[2, i, c]
                 way = np.sqrt(x * x + y * y)
@@ -86,14 +86,14 @@ def _without_steps(
                 if beside and abs(up) > slope * way + OUTLIER * np.sqrt(square) + step / 8:
                     even[i, c] = even[k, m] = False
                 p, q = k + down, m + right
-                if 2 * way < step or abs(up) <= slope * way or p >= rows or q >= columns:
+                if 2 * way < step or p >= rows or q >= columns or not variance[p, q] > 0:
                     continue
-                if not variance[p, q] > 0:
+                if e > 0 and abs(up) <= slope * way:
                     continue
                 total = place[0, p, q] - place[0, i, c]
                 x, y = place[1, p, q] - place[1, k, m], place[2, p, q] - place[2, k, m]
                 on = np.sqrt(x * x + y * y)
-                if up * (total - up) <= 0 or abs(total - up) <= slope * on:
+                if e > 0 and (up * (total - up) <= 0 or abs(total - up) <= slope * on):
                     continue
                 noise = CLEARLY * np.sqrt(variance[i, c] + variance[p, q])
                 if abs(total) > slope * (way + on) + noise:
