@@ -5,7 +5,9 @@ PYTHON ?= $(shell for python in python3.12 "$$(pyenv prefix 3.12 2>&1)/bin/pytho
   "$$python" -c '' 2>/dev/null && echo "$$python" && break; done)
 VENV ?= .venv
 BIN := $(VENV)/bin
-SYSTEM_ROS := $(shell $(PYTHON) -c 'import rclpy' 2>/dev/null && echo --system-site-packages)
+# Not the wheels of a virtual environment that is active.
+SYSTEM_ROS := $(shell $(PYTHON) -c 'import rclpy, sys; assert sys.prefix == sys.base_prefix' \
+  2>/dev/null && echo --system-site-packages)
 
 # Most tests keep one core busy. All tests of a file run in the same process.
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile
