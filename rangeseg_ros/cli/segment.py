@@ -13,6 +13,7 @@ from rangeseg_ros.cli.errors import one_line
 from rangeseg_ros.compilation.preparation import prepare, show
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.core.sensing.camera import CameraError
 from rangeseg_ros.core.sequence import with_roles
 from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.io.depth_files import CLOUDS, Intrinsics, files_in, read_frame, scale_of
@@ -80,9 +81,10 @@ def command(
     for path, scale in options.progress(frames, len(frames), 'image'):
         try:
             image = corrected(read_frame(path, intrinsics, scale), config)
+        except CameraError:  # of all images
+            raise
         except (ValueError, OSError) as error:
-            named = '' if str(path) in one_line(error) else f'{path}: '
-            options.say(f'rangeseg: {named}{one_line(error)}', err=True)
+            options.say(f'rangeseg: {path}: {one_line(error).removeprefix(f"{path}: ")}', err=True)
             refused += 1
             continue
         result = segmenter.segment(image)

@@ -6,7 +6,6 @@ import zipfile
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,10 +88,9 @@ def read_frame(path: Path, intrinsics: Intrinsics, scale: float | None = None) -
     """
     suffix = path.suffix.lower()
     known = intrinsics.camera.shape if intrinsics.camera else None
-    array: NDArray[Any]
     if suffix == '.pcd':
         points = read_pcd(path, *'xyz')
-        array = organised(points[0], known, path) if len(points) == 1 else points
+        array: NDArray = organised(points[0], known, path) if len(points) == 1 else points
     elif suffix == '.ply':
         array = read_ply(path, known)
     elif suffix in ('.npy', '.npz'):

@@ -141,10 +141,11 @@ def _upright(
         # Without a height the ground is what the camera stands on: a table tells by its size.
         size = float(np.ptp(place[1:, reached], axis=1).max()) if seen else 0.0
         sure = size >= FURNITURE
-        reason = f'what is seen below is {size:.2f} m wide and may be a table: state sensor_height'
+        told = f'{size:.2f} m of a surface may be a table: state sensor_height'
+        reason = told if size > config.least_step else ''
     if seen is None or not sure:
         confidence = seen.confidence if seen and height_sd > 0 else 0.0
-        stand = Stand(np.zeros(3), confidence, (reason,) if seen or height_sd > 0 else ())
+        stand = Stand(np.zeros(3), confidence, (reason,) if reason else ())
         return _without_ground(image, cells, seen, stand, known, config)
     a, b, c = seen.plane
     lean = np.array([b, c]) @ cells.axes[1:]
