@@ -71,7 +71,7 @@ def test_frame_without_valid_depth(bench):
     image = bench.image(np.full((120, 160), np.nan, np.float32), '32FC1')
     assert not bench.segment(image).any()
     status = bench.reported(
-        lambda status: status.message == 'no planes: no valid depth',
+        lambda status: status.message == 'Nothing in the image is measured.',
         lambda: bench.depth.publish(image),
     )
     assert status.level == DiagnosticStatus.WARN

@@ -211,7 +211,7 @@ def test_without_an_up_there_is_no_terrain(tf_messages):
         )
         assert (0, 0) in {(ground, free) for ground, _, free in found}
         assert published(bench, PITCH + np.radians(25), robot, ahead=60) == (0, 0, 0)
-        bench.status(lambda s: s.level == DiagnosticStatus.ERROR and 'up is off by' in s.message)
+        bench.status(lambda s: s.level == DiagnosticStatus.ERROR and 'is off by' in s.message)
         assert bench.set_parameters(use_imu=True)[0].successful
         level = Imu(header=bench.header())
         level.header.frame_id, level.linear_acceleration.y = FRAME, -9.8
