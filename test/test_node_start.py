@@ -78,10 +78,14 @@ for arguments in eval(sys.argv[1]):
 
 
 def test_bad_arguments_end_with_one_line(tmp_path):
-    own = tmp_path / 'own.yaml'
-    own.write_text('ns:\n  segment_planes:\n    ros__parameters: {smothness: 3.0}\n')
-    file = '--ros-args', '-r', '__ns:=/ns', '--params-file', os.fspath(own)
-    bad = {**BAD, "is 'smoothness' meant?": file}
+    bad, quality = dict(BAD), '{/ns/depth/image_rect: {subscription: {relaibility: reliable}}}'
+    for words, own in (
+        ("is 'smoothness' meant?", 'smothness: 3.0'),
+        (".reliability' meant?", f'qos_overrides: {quality}'),
+    ):
+        file = tmp_path / f'{len(bad)}.yaml'
+        file.write_text(f'ns:\n  segment_planes:\n    ros__parameters: {{{own}}}\n')
+        bad[words] = '--ros-args', '-r', '__ns:=/ns', '--params-file', os.fspath(file)
     run = python(EACH_IN_A_FORK, repr([*bad.values()]))
     assert run.stdout.split() == ['2'] * len(bad), run.stderr
     for line, words in zip(run.stderr.splitlines(), bad, strict=True):

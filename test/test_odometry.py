@@ -151,6 +151,23 @@ def test_points_at_jump_edges_tell_a_known_motion_as_well_as_is_said():
     assert 0.005 < np.mean(values) < 1 and np.median(shifts) < 0.01
 
 
+def test_points_without_a_counterpart_move_the_camera_by_less_than_their_share():
+    """As of edges that are hidden in the next image, near others: an eighth of all points."""
+    random, moved, aside = np.random.default_rng(1), [], np.array([0.03, 0.03, 0.0])
+    prior = np.diag(np.repeat([0.03, 0.05, 1e-9, 1e-9], 3) ** 2)
+    for _ in range(40):
+        before, found = Transform.identity(), []
+        true = before.by(np.concatenate([np.zeros(3), random.normal(0, 0.01, 3)]))
+        last, now = (outline_of(*each, random) for each in (before, true))
+        with_hidden = np.concatenate([last.points, last.points[::8] + aside])
+        for points in last.points, with_hidden:
+            design, told = now.motion(last._replace(points=points), before, before, prior)
+            information = design.T @ design + np.linalg.inv(prior)
+            found.append(np.linalg.solve(information, design.T @ told)[3:6])
+        moved.append(np.linalg.norm(found[1] - found[0]))
+    assert np.median(moved) < np.linalg.norm(aside) / 9
+
+
 def test_edges_are_taken_in_as_a_filter_does():
     """Against the information form: inverse covariances add up."""
     draw, odometry = np.random.default_rng(3), PlaneOdometry()

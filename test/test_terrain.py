@@ -246,6 +246,17 @@ def test_a_chain_goes_on_a_while_after_what_is_off_the_ground():
     assert reached[13:].all()
 
 
+def test_no_chain_goes_down_an_edge_that_is_blurred_over_two_cells():
+    """Columns of 34 mm, 5.5 mm of noise: 38 mm down from the first on, with one cell between."""
+    rows, columns = np.indices((60, 24))
+    height = np.select([columns < 10, columns < 11], [0.0, -0.015], -0.038)
+    # A chain starts where all is ground.
+    height[rows < 12] = 0.0
+    place = np.stack([height, 2.0 + 0.04 * rows, 0.034 * columns])[:, ::-1]
+    reached = reach(place, np.full(rows.shape, 0.0055**2), Config(), False)[::-1]
+    assert reached[:, :9].all() and not reached[20:, 10:].any()
+
+
 SEEN = np.degrees(np.arctan2(240, Kinect(0).camera.fy))  # below the middle of the image
 ABOVE = 0.8
 

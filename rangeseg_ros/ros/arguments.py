@@ -73,7 +73,7 @@ def check_parameters(node: Node, arguments: list[str]) -> None:
         problem = unknown_parameter(name, known | set(OF_EVERY_NODE))
         # `ros2 param dump` writes those of the topics that a node had, maybe under other names.
         foreign = name.startswith('qos_overrides.') and name.split('.')[1] not in topics
-        if not foreign and name in own:
+        if not foreign and own & {name, name.partition('.')[0]}:
             raise ConfigError(problem)
         problem = f'{name!r} is of another topic' if foreign else f'{problem} (of another node?)'
         node.get_logger().warning(f'{problem}, ignored')

@@ -300,15 +300,15 @@ class PlaneMap:
 
     def _forget(self) -> None:
         """Drop planes of which nothing is left, clutter out of sight, and what is too much."""
-        trial = self._time - 1e9 * self.config.track_time
-        least = self.config.map_area
-        kept = [
+        trial, least = self._time - 1e9 * self.config.track_time, self.config.map_area
+        enough = (
             r.grid.sure_area > least or (r.seen >= trial and r.grid.area > 0)
             for r in self._records
-        ]
+        )
+        kept = np.fromiter(enough, np.bool_, len(self._records))
         # Those out of sight the longest are forgotten first, and of these the ones hardly seen.
-        if sum(kept) > self.config.map_planes:
+        if kept.sum() > self.config.map_planes:
             rank = [(k, r.seen, r.observations) for k, r in zip(kept, self._records, strict=True)]
             order = sorted(range(len(rank)), key=rank.__getitem__, reverse=True)
-            kept = np.isin(range(len(rank)), order[: self.config.map_planes]).tolist()
-        self._keep(np.array(kept, np.bool_))
+            kept = np.isin(range(len(rank)), order[: self.config.map_planes])
+        self._keep(kept)
