@@ -12,8 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.config import NAMES, Config
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.options import ConfigError, unknown_parameter
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.camera import Camera
@@ -53,13 +54,14 @@ def segment(
     --------
     >>> result = rangeseg_ros.segment(depth, rangeseg_ros.Camera.from_fov(640, 480, 57))
     """
+    for name in parameters.keys() - NAMES:
+        raise ConfigError(unknown_parameter(name, {'scale', *NAMES}))
     config = Config.from_mapping(parameters)
     if camera is None:
         image = RangeImage.from_points(depth)
     else:
         image = RangeImage.from_depth(depth, camera, scale)
-    image = corrected(image, config)
-    result = Segmenter(config).segment(image)
+    result = Segmenter(config).segment(corrected(image, config))
     return replace(result, planes=with_roles(result.planes, config, result.up))
 
 

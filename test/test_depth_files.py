@@ -41,7 +41,8 @@ def write_ply(path, points, binary=True, size=True):
     path.write_bytes('\n'.join([*head, 'end_header', '']).encode() + body)
 
 
-KINDS = 'png', 'tiff', 'float.tiff', 'npy', 'int64.npy', 'npz', 'Z.exr', 'R,G,B.exr', 'A.Z,B.R.exr'
+KINDS = ['png', 'pgm', 'float.pfm', 'tiff', 'float.tiff', 'npy', 'int64.npy', 'npz']
+KINDS += ['Z.exr', 'R,G,B.exr', 'A.Z,B.R.exr']
 
 
 @pytest.mark.parametrize('kind', KINDS)

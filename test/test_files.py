@@ -28,8 +28,7 @@ from rangeseg_ros.io.yaml_files import read_yaml
 def test_what_is_no_depth_image_is_named(tmp_path):
     for name, image, message in (
         ('colour.png', np.zeros((4, 5, 3), np.uint16), 'one channel, not 3'),
-        ('a.bmp', np.ones((8, 8), np.uint8), 'PNG, or TIFF'),
-        ('a.pfm', np.ones((8, 8), np.float32), 'PNG, or TIFF'),
+        ('a.bmp', np.ones((8, 8), np.uint8), 'PNG, PGM, PFM, or TIFF'),
     ):
         cv2.imwrite(str(tmp_path / name), image)
         with pytest.raises(FileError, match=f'{name}: .*{message}'):
@@ -40,7 +39,7 @@ def test_what_is_no_depth_image_is_named(tmp_path):
         read_depth(tmp_path)
     for content in (b'', b'no image', b'\x89PNG\r\n\x1a\n'):
         (tmp_path / 'text.png').write_bytes(content)
-        with pytest.raises(FileError, match=r'text\.png: not a readable PNG'):
+        with pytest.raises(FileError, match=r'text\.png: no readable PNG'):
             read_depth(tmp_path / 'text.png')
 
 

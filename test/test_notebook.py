@@ -86,6 +86,8 @@ def test_errors_have_a_suggestion(seen, monkeypatch):
     for call, kind, words in (
         (lambda: Config(smothness=3), ConfigError, "'smoothness' meant"),
         (lambda: rangeseg_ros.segment(depth, camera, smothness=3), ConfigError, 'smoothness'),
+        (lambda: rangeseg_ros.segment(depth, camera, depth_scale=1), ConfigError, "'scale' meant"),
+        (lambda: Config.from_mapping([1]), ConfigError, r'names and their values, not \[1\]'),
         (lambda: Segmenter().segment(depth), ValueError, r'RangeImage.from_depth\(depth, camera'),
         (lambda: Segmenter({'noise': 0.001}), ConfigError, r'must be a Config\(...\), not {'),
         (lambda: RangeImage.from_depth(depth, (525, 525)), ValueError, r'a Camera\(width'),

@@ -162,6 +162,7 @@ def test_eight_bits_have_no_unit_but_the_stated_one():
     ('depth', 'scale', 'message'),
     [
         (np.zeros((3, 4, 1), np.uint16), None, r'\(H, W\), not \(3, 4, 1\)'),
+        ([[1, 2], [3]], None, r'rows differ in length: \[\[1'),
         ('depth.png', None, r"\(H, W\), not 'depth.png'"),
         (np.zeros((3, 4), bool), None, 'floats, not bool'),
         (np.zeros((4, 4), np.uint16), None, '4x4'),

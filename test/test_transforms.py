@@ -168,8 +168,9 @@ def test_matrices_that_are_no_motion_are_refused():
         change(bad)
         with pytest.raises(TransformError, match=wrong):
             Transform.from_matrix(bad)
-    with pytest.raises(TransformError, match='4x4'):
-        Transform.from_matrix(np.eye(3))
+    for matrix in (np.eye(3), 'a', [[1], [2, 3]]):
+        with pytest.raises(TransformError, match='4x4'):
+            Transform.from_matrix(matrix)
 
 
 TURNS = np.concatenate(

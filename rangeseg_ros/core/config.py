@@ -243,6 +243,8 @@ class Config:
         FutureWarning
             A parameter has another name now; its value is converted.
         """
+        if not isinstance(mapping, Mapping):
+            raise ConfigError(f'parameters are names and their values, not {mapping!r:.60}')
         mapping = _renamed(mapping)
         _check_names(cls, mapping)
         return cls(**mapping)

@@ -18,7 +18,7 @@ from rangeseg_ros.io.images import read_depth
 from rangeseg_ros.io.pcd import read_pcd
 from rangeseg_ros.io.ply import organised, read_ply
 
-IMAGES = ('.png', '.tif', '.tiff')
+IMAGES = ('.png', '.tif', '.tiff', '.pgm', '.pfm')
 CLOUDS = ('.pcd', '.ply')
 SUFFIXES = (*IMAGES, '.exr', '.npy', '.npz', *CLOUDS)
 # Of the benchmark of TUM, whose images are in 1/5000 m.

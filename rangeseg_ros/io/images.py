@@ -14,7 +14,7 @@ from rangeseg_ros.messages.images import shape_and_pages
 
 
 def read_depth(path: Path, shape: tuple[int, int] | None = None) -> NDArray:
-    """Depth image (H, W) of a PNG or TIFF of 8 or 16 bits or floats, in the unit of the file.
+    """Depth image (H, W) of a PNG, PGM, PFM or TIFF of 8 or 16 bits or floats, in its unit.
 
     FileError: another kind of image or, before it is decoded, another size than `shape` (H, W).
     """
@@ -63,9 +63,8 @@ def write_image(path: Path, image: NDArray) -> None:
 
 def _read(path: Path, shape: tuple[int, int] | None = None) -> NDArray:
     data = read_bytes(path)
-    size, pages = shape_and_pages(data, 'PNG')
-    if size is None:
-        size, pages = shape_and_pages(data, 'TIFF')
+    kinds = (shape_and_pages(data, kind) for kind in ('PNG', 'TIFF', 'PPM'))
+    size, pages = next((found for found in kinds if found[0]), (None, 0))
     if size and shape and size != shape:
         raise FileError(
             f'{path}: depth image is {size[1]}x{size[0]}, its camera {shape[1]}x{shape[0]}'
@@ -76,7 +75,7 @@ def _read(path: Path, shape: tuple[int, int] | None = None) -> NDArray:
     except cv2.error:
         image = None
     if image is None:
-        raise FileError(f'{path}: not a readable PNG, or TIFF of 8 or 16 bits or float32')
+        raise FileError(f'{path}: no readable PNG, PGM, PFM, or TIFF of 8 or 16 bits or float32')
     if pages > 1:
         warnings.warn(f'{path}: only the first of {pages} pages is read', stacklevel=3)
     return image

@@ -88,7 +88,7 @@ def _compressed(
 
 
 def shape_and_pages(data: bytes, kind: str) -> tuple[tuple[int, int] | None, int]:
-    """(H, W) of a PNG or of the first page of a TIFF, and the number of pages.
+    """(H, W) and pages of a PNG, of a PGM or PFM (PPM), or of the first page of a TIFF.
 
     None for others, and for a PNG whose checksums say that it is damaged. Found before decoding:
     OpenCV would take gigabytes for a damaged length, and libpng complain on stderr.

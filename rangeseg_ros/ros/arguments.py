@@ -42,10 +42,9 @@ def check_arguments(arguments: list[str]) -> None:
     """Refuse what is no ROS argument (ConfigError); print the help and exit when asked for it."""
     own = remove_ros_args(arguments)[1:]
     if '-h' in own or '--help' in own:
-        print(USAGE, end='')
-        for field in fields(NodeConfig):
-            description = field.metadata['description']
-            print(f'  {field.name} (default {field.default!r}): {description}')
+        known = ((f.name, f.default, f.metadata['description']) for f in fields(NodeConfig))
+        lines = (f'  {name} (default {value!r}): {does}' for name, value, does in known)
+        print(USAGE + '\n'.join(lines))  # at once, for who reads the first lines alone
         sys.exit(0)
     if own:
         raise ConfigError(

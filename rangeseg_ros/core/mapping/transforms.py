@@ -57,7 +57,10 @@ class Transform(NamedTuple):
     @classmethod
     def from_matrix(cls, matrix: ArrayLike) -> Transform:
         """Motion of a 4x4 matrix, its rotation the nearest one; TransformError if not rigid."""
-        values = np.asarray(matrix, np.float64)
+        try:
+            values = np.asarray(matrix, np.float64)
+        except (ValueError, TypeError):
+            raise TransformError(f'not a 4x4 matrix: {matrix!r:.60}') from None
         if values.shape != (4, 4):
             raise TransformError(f'not a 4x4 matrix: shape {values.shape}')
         if not np.isfinite(values).all():

@@ -298,6 +298,9 @@ def _reciprocals(scale: float) -> NDArray[np.float32]:
 
 def _unmasked(values: ArrayLike) -> tuple[NDArray, NDArray[np.bool_] | None]:
     """Values as a plain array, and where a mask hides them."""
-    if not isinstance(values, np.ma.MaskedArray):
+    if isinstance(values, np.ma.MaskedArray):
+        return values.data, np.ma.getmaskarray(values)
+    try:
         return np.asarray(values), None
-    return values.data, np.ma.getmaskarray(values)
+    except ValueError:
+        raise RangeImageError(f'no array: rows differ in length: {values!r:.60}') from None
