@@ -1,4 +1,7 @@
-"""Pages of the site that are not in docs/: README.md, CONTRIBUTING.md, and the parameters."""
+"""Pages of the site that are not in docs/: README.md, CONTRIBUTING.md, and the parameters.
+
+And the docstrings below the table of the Python interface.
+"""
 
 import re
 from dataclasses import fields
@@ -24,6 +27,18 @@ def on_files(files, config):
         files.append(File.generated(config, page, content=text))
     files.append(File.generated(config, 'parameters.md', content=parameters()))
     return files
+
+
+def on_page_markdown(markdown, page, **_):
+    """Add what the docstrings say of the names in the table of api.md."""
+    if page.file.src_uri != 'api.md':
+        return markdown
+    parts = [markdown]
+    for name in re.findall(r'^\| `(\w+)`', markdown, re.M):
+        # Its fields are the page of the parameters.
+        members = '\n    options:\n      members: [from_mapping]' * (name == 'Config')
+        parts += [f'::: rangeseg_ros.{name}{members}'] * (name != 'ROLES')
+    return '\n\n'.join(parts)
 
 
 def parameters():

@@ -18,6 +18,7 @@ import yaml
 from click.testing import CliRunner
 from matplotlib import pyplot
 
+import rangeseg_ros
 from rangeseg_ros import RangeImage
 from rangeseg_ros.cli.main import rangeseg
 from rangeseg_ros.io.tables import columns
@@ -43,6 +44,13 @@ def test_links_and_names_of_files_lead_somewhere(page):
     for name in re.findall(r'`((?:[\w.]+/)*\w+\.(?:py|md|toml|cff|rst))`', text):
         nested = [folder / name for folder in FOLDERS]
         assert any(path.exists() for path in nested) or any(PACKAGE.rglob(name)), name
+
+
+def test_the_python_interface_is_listed():
+    rows = re.findall(r'^\| `(\w+)` \| (.*) \|$', (ROOT / 'docs/api.md').read_text(), re.M)
+    assert {name for name, _ in rows} == {*rangeseg_ros.__all__} - {'__version__'}
+    for name, text in rows[:-1]:
+        assert text == getattr(rangeseg_ros, name).__doc__.splitlines()[0]
 
 
 @pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)

@@ -27,7 +27,7 @@ def plane_regions(
     `min_pixels`.
     """
     components = connected_components(labels, grid, valid)
-    area = np.bincount(components.ravel())
+    area = region_sizes(components, int(components.max()) + 1)
     area[0] = 0
     return relabel(components, by_falling_size(np.where(area < min_pixels, 0, area)))
 
@@ -74,11 +74,17 @@ def connected_components(
 
 
 @njit(cache=True, nogil=True)
-def region_sizes(regions: NDArray[np.uint16], count: int) -> NDArray[np.intp]:
+def region_sizes(regions: NDArray[np.integer], count: int) -> NDArray[np.intp]:
     """Pixels (count,) of each region 0...count - 1."""
     sizes = np.zeros(count, np.intp)
-    for region in regions.flat:
-        sizes[region] += 1
+    for i in range(len(regions)):
+        # By runs: one counter cannot take a pixel more before it has taken the last.
+        last, begin = regions[i, 0], 0
+        for j in range(regions.shape[1]):
+            if regions[i, j] != last:
+                sizes[last] += j - begin
+                last, begin = regions[i, j], j
+        sizes[last] += regions.shape[1] - begin
     return sizes
 
 
