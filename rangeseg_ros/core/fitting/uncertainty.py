@@ -7,8 +7,6 @@ whose pixels spread like a Gaussian of their variance: then its mean has a close
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -23,31 +21,6 @@ _FAR = 5.0
 _ROW, _COLUMN, _FULL = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2), (0, 1, 2, 1, 3, 4, 2, 4, 5)
 
 
-class Cells(NamedTuple):
-    """Cells of regions as a Gaussian field sees them; see `RegionSums` for which are whose."""
-
-    place: NDArray[np.float64]  # (N, 4), mean row and column of the pixels, and their variances
-    pixels: NDArray[np.float64]  # (N,), number of them
-    ray: NDArray[np.float64]  # (N, 3), sum of the weighted rays, times the deviation
-    deviation: NDArray[np.float64]  # (N,), standard deviation of the field
-    width: float  # of the kernel that it looks smoothed with, pixels
-
-    @classmethod
-    def of(
-        cls, sums: RegionSums, level: NDArray[np.float64], field: tuple[float, float, float]
-    ) -> Cells:
-        """Cells whose planes are at inverse ranges y (N,); of variance constant + quartic y^4."""
-        width, constant, quartic = field
-        cells = sums.cells
-        count = cells[:, COUNT]
-        mean = cells[:, PLACE : PLACE + 4] / count[:, None]
-        spread = np.maximum(mean[:, 2:] - mean[:, :2] ** 2, 0)
-        deviation = np.sqrt(constant + quartic * level**4)
-        ray = deviation[:, None] * cells[:, RAY : RAY + 3]
-        # A model whose numbers are given as integers is one of numbers all the same.
-        return cls(np.hstack([mean[:, :2], spread]), count, ray, deviation, float(width))
-
-
 def covariance_roots(
     sums: RegionSums, level: NDArray[np.float64], inverse: NDArray[np.float64], sensor: SensorModel
 ) -> NDArray[np.float64]:
@@ -59,21 +32,18 @@ def covariance_roots(
     smooth = 1 - sensor.white if sensor.correlation > 0 else 0.0
     noise = smooth * (FLOOR + sensor.noise**2), smooth * sensor.range_noise**2
     distortion = sensor.distortion**2, sensor.range_distortion**2
-    weight, ray = sums.cells[:, WEIGHT], sums.cells[:, RAY : RAY + 3]
-    mean, scatter = weight / sums.cells[:, COUNT], sums.cells[:, :6]
-    centred = scatter - ray[:, _ROW] * ray[:, _COLUMN] / weight[:, None]
     # Squares of the same scale as the rays: variance times weight.
-    white = (1 - smooth) * random_variance(sensor, level**2) * mean
-    own = white[:, None] * scatter
-    middle = np.zeros((len(inverse), 3, 3))
+    white = (1 - smooth) * random_variance(sensor, level**2)
+    white *= sums.cells[:, WEIGHT] / sums.cells[:, COUNT]
+    total = sum_by_label(sums.owners, white[:, None] * sums.cells[:, :6], len(inverse))
+    middle = total[:, _FULL].reshape(-1, 3, 3)
+    place = sums.cells[:, PLACE : PLACE + 4] / sums.cells[:, COUNT, None]
+    place[:, 2:] = np.maximum(place[:, 2:] - place[:, :2] ** 2, 0)
     for field in ((sensor.correlation, *noise), (sensor.distortion_length, *distortion)):
         if field[1] + field[2] > 0:
-            cells = Cells.of(sums, level, field)
-            own += (_within(cells) * mean)[:, None] * centred
-            half = _between(sums.start, cells)
+            # A model whose numbers are given as integers is one of numbers all the same.
+            half = _halves(sums, level, place, *map(float, field))
             middle += half + half.transpose(0, 2, 1)
-    total = sum_by_label(sums.owners, own, len(inverse))
-    middle += total[:, _FULL].reshape(-1, 3, 3)
     return roots(inverse, middle)
 
 
@@ -109,27 +79,41 @@ def plane_jacobians(
     return np.concatenate([-distance[:, None, None] * tangent, along], axis=1)
 
 
-def _within(cells: Cells) -> NDArray[np.float64]:
-    """Variance (N,) by which a field varies in cells, as far as it is narrower than they are."""
-    variance, spread = 2 * cells.width**2, cells.place[:, 2:]
-    total = np.maximum((variance + 2 * spread).prod(axis=1), 1e-300)
-    alike = np.maximum(cells.pixels * variance / np.sqrt(total), 1)
-    mean = spread.mean(axis=1)
-    share = mean / np.maximum(variance + mean, 1e-300)
-    result: NDArray[np.float64] = share * alike * cells.deviation**2
-    return result
-
-
 @njit(cache=True, nogil=True)
-def _between(start: NDArray[np.intp], cells: Cells) -> NDArray[np.float64]:
-    """Half the sums over pairs of cells (M + 1, 3, 3) of regions: but for the transposes."""
-    result = np.zeros((len(start) - 1, 3, 3))
-    variance = 2 * cells.width**2
-    place, count, ray = cells.place, cells.pixels, cells.ray
+def _halves(
+    sums: RegionSums,
+    level: NDArray[np.float64],
+    place: NDArray[np.float64],
+    width: float,
+    constant: float,
+    quartic: float,
+) -> NDArray[np.float64]:
+    """Halves of the sums over pairs of pixels (M + 1, 3, 3) of regions: but for the transposes.
+
+    Of a Gaussian field that looks smoothed with a kernel of this width, pixels, and has the
+    variance constant + quartic y^4. `place` (N, 4) are the mean row and column of the pixels of
+    cells, and their variances.
+    """
+    result = np.zeros((len(sums.start) - 1, 3, 3))
+    variance, ray = 2 * width**2, np.empty((len(level), 3))
     for k in range(len(result)):
-        for i in range(start[k], start[k + 1]):
+        begin, end = sums.start[k], sums.start[k + 1]
+        for i in range(begin, end):
+            cell, own = sums.cells[i], constant + quartic * level[i] ** 4
+            for p in range(3):
+                ray[i, p] = np.sqrt(own) * cell[RAY + p]
+            # As far as the field is narrower than the cell, it varies within.
+            total = (variance + 2 * place[i, 2]) * (variance + 2 * place[i, 3])
+            alike = max(cell[COUNT] * variance / np.sqrt(max(total, 1e-300)), 1.0)
+            spread = (place[i, 2] + place[i, 3]) / 2
+            own *= spread / max(variance + spread, 1e-300) * alike * cell[WEIGHT] / cell[COUNT]
+            for entry in range(6):
+                p, q = _ROW[entry], _COLUMN[entry]
+                centred = cell[entry] - cell[RAY + p] * cell[RAY + q] / cell[WEIGHT]
+                result[k, p, q] += own * centred / (1 + (p == q))
+        for i in range(begin, end):
             x = y = z = 0.0
-            for j in range(i, start[k + 1]):
+            for j in range(i, end):
                 down = variance + place[i, 2] + place[j, 2]
                 across = variance + place[i, 3] + place[j, 3]
                 lag = (place[i, 0] - place[j, 0]) ** 2 / max(down, 1e-300)
@@ -139,7 +123,7 @@ def _between(start: NDArray[np.intp], cells: Cells) -> NDArray[np.float64]:
                 alike = variance / np.sqrt(max(down * across, 1e-300)) * np.exp(-lag / 2)
                 if lag == 0:
                     # A pixel agrees with itself.
-                    alike = max(alike, 1 / min(count[i], count[j]))
+                    alike = max(alike, 1 / min(sums.cells[i, COUNT], sums.cells[j, COUNT]))
                 alike /= 1 + (i == j)
                 x, y, z = x + alike * ray[j, 0], y + alike * ray[j, 1], z + alike * ray[j, 2]
             for p in range(3):
