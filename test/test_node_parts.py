@@ -11,6 +11,7 @@ import pytest
 from rangeseg_ros.core.sensing.binning import STEPS, step_within
 from rangeseg_ros.ros import counting
 from rangeseg_ros.ros.counting import Losses, Window
+from rangeseg_ros.ros.diagnostics import FrameStatistics
 from rangeseg_ros.ros.handover import TicketLock
 from rangeseg_ros.ros.pace import Pace
 from rangeseg_ros.ros.pairing import KEPT, Found, StampPairing
@@ -101,6 +102,19 @@ def test_recent_events_and_their_rate(clock):
     clock.now += counting.WINDOW
     window.add(3)
     assert (window.recent(), window.total, window.rate()) == (3, 34, 0.0)
+
+
+def test_silence_counts_from_the_first_frame_without_an_answer(clock):
+    statistics = FrameStatistics()
+    assert statistics.stalled() == 0
+    statistics.accepted(0)
+    clock.now += 2
+    statistics.accepted(1)
+    clock.now += 1
+    assert statistics.stalled() == 3
+    statistics.answered(statistics.refused)
+    assert statistics.stalled() == 0
+    assert (statistics.received.total, statistics.dropped.total) == (2, 1)
 
 
 def test_losses_are_believed_that_a_camera_can_have_had(clock):

@@ -136,6 +136,11 @@ def test_nav2_reads_the_map_and_the_picture_shows_its_cells(folders):
     assert at(2.0, -0.8) == at(AHEAD, -0.85) == at(AHEAD + 0.4, -0.9) == 'free'
     assert at(AHEAD + 1, 0.3) == 'unknown'
     picture, side = ET.parse(folders / 'level/plan.svg').getroot(), about['resolution']
+    left, top, *size = map(float, picture.get('viewBox').split())
+    for shape in picture.iter():
+        for axes, first, length in (('x x1 x2', left, size[0]), ('y y1 y2', top, size[1])):
+            at = [float(shape.get(axis)) for axis in axes.split() if shape.get(axis)]
+            assert all(first <= place <= first + length for place in at)
     legend = [text.text for text in picture.iterfind('.//{*}g[@id="legend"]/{*}text')]
     assert legend[1:] == ['to 2 mm', 'to 5 mm', 'to 10 mm', 'to 20 mm', 'more']
     for name, shade in (('free', 254), ('obstacles', 0)):

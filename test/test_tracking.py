@@ -71,6 +71,17 @@ def test_a_hidden_plane_moves_along_with_the_camera():
     assert ids(tracker, frame(*view, (*right, decoy), (*MIDDLE, box))) == [1, 2, 3, 5, 4]
 
 
+def test_moved_planes_still_hold_their_points():
+    labels, planes = frame(*STAY)
+    tracks = Tracks.of(planes, labels)
+    there = tracks.moved(Rotation.from_rotvec([0.3, -0.2, 0.1]).as_matrix(), np.array([1, 2, 3.0]))
+    np.testing.assert_allclose(np.linalg.norm(there.plane[:, :3], axis=1), 1)
+    off = [(t.plane[:, :3] * t.centroid).sum(axis=1) + t.plane[:, 3] for t in (tracks, there)]
+    np.testing.assert_allclose(off[0], off[1], atol=1e-12)
+    apart = [np.linalg.norm(t.centroid - t.centroid[0], axis=1) for t in (tracks, there)]
+    np.testing.assert_allclose(apart[0], apart[1])
+
+
 def test_what_moves_by_itself_does_not_move_the_camera():
     """Three planes stand, a box before them comes nearer: the farther, the less it counts."""
     shifts = []
