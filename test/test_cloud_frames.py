@@ -10,7 +10,7 @@ from message_classes import header, make_rosbags
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter, SequenceSegmenter, Transform
 from rangeseg_ros.core.ground.cells import GROUND
-from rangeseg_ros.core.ground.points import drops, outlines
+from rangeseg_ros.core.ground.points import outlines
 from rangeseg_ros.core.rotations import rotation_by, rotation_matrix
 from rangeseg_ros.core.sensing.clouds import depth_of
 from rangeseg_ros.messages.outputs import OUTPUTS
@@ -112,10 +112,13 @@ def test_a_room_is_segmented_as_its_depth_image(frame, method):
         assert axis @ turn[:, 0] >= -1e-6  # to the right of the image
     assert str(result.ground) == str(expected.ground)
     assert (result.terrain == expected.terrain).mean() > 0.999
-    for find in (drops, lambda *seen: np.concatenate(outlines(*seen))):
-        here, there = find(image, expected.ground)[:, :3], find(cloud, result.ground)[:, :3]
-        assert len(here) == pytest.approx(len(there), rel=0.02)
-        np.testing.assert_allclose((here @ turn.T + place).mean(0), there.mean(0), atol=0.02)
+    pairs = (image, expected), (cloud, result)
+    here, there = (np.concatenate(outlines(seen, found.ground))[:, :3] for seen, found in pairs)
+    assert len(here) == pytest.approx(len(there), rel=0.02)
+    np.testing.assert_allclose((here @ turn.T + place).mean(0), there.mean(0), atol=0.02)
+    cells = [OUTPUTS['grid_points'].message(make_rosbags, header(), *pair) for pair in pairs]
+    here, there = (each.data.view('<f4').reshape(-1, 6)[:, :3].mean(axis=0) for each in cells)
+    np.testing.assert_allclose(turn @ here + place, there, atol=0.02)
     ground = OUTPUTS['ground'].message(make_rosbags, header(), cloud, result)
     points, shown = np.frombuffer(ground.data, '<f4').reshape(-1, 4), result.terrain == GROUND
     np.testing.assert_allclose(points[:, :3], cloud.points[shown], atol=1e-6)
