@@ -189,6 +189,8 @@ def no_cameras():
         'wall': wall,
         'parallel rays': np.stack([u * 0.01, v * 0.01, 2 + 0.3 * np.sin(u / 50)], axis=2),
         'lens': points * np.concatenate([bent, bent, np.ones_like(bent)], axis=2),
+        # Between the rows and columns that tell the camera.
+        'one point off': points + 0.05 * ((u == 10) & (v == 10))[..., None] * (1, 1, 0),
         'scanner': scanned(CAMERA) * np.linalg.norm(points, axis=2)[..., None],
         'mirrored': points * (-1, 1, 1),
         'axes mirrored': points[..., [1, 0, 2]],

@@ -56,6 +56,14 @@ def test_white_noise_is_measured_up_and_down(noise, holes):
     assert sensor.white > 0.7 and sensor.distortion < 0.6 * noise
 
 
+def test_quantisation_shows_beside_steps_of_several_quanta():
+    random = np.random.default_rng(7)
+    steps = random.choice([1, 2, 3, 4], (100, 200)) * random.choice([-1, 0, 1], (100, 200))
+    rows = np.arange(500, 2000, 15)[:, None]
+    found = quantisation((1e-3 * (rows + np.cumsum(steps, axis=1))).astype(np.float32))
+    assert found == (pytest.approx(1e-3, rel=1e-3), 0)
+
+
 def test_the_standard_error_of_the_noise_is_what_it_scatters_by():
     found = []
     for seed in range(12):

@@ -1,5 +1,7 @@
 """Terrain: what robots fall into and run into, in scenes with known answers."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from rangeseg_ros.core.ground.points import drops, outlines, unseen
 from rangeseg_ros.core.ground.reach import reach
 from rangeseg_ros.core.ground.terrain import terrain_of
 from rangeseg_ros.core.segmentation import STATED
-from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.core.sequence import SequenceSegmenter, with_roles
 from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.sensors.kinect import Kinect
 from rangeseg_ros.simulation.sensors.sensor import resize
@@ -123,6 +125,9 @@ def test_ramps_are_ground_as_long_as_they_are_not_steep(degrees, missed):
     floor = Piece(slab(-3, 1.5, 0, 0, ALL), GROUND)
     _, result, frame = found(scene(floor, ramp))
     assert share(result.terrain, frame, GROUND, GROUND) > 0.97
+    planes = with_roles(result.planes, result.survey.config, result.up)
+    ramps = replace(result, planes=planes).ramps
+    assert [ramp.slope for ramp in ramps] == [pytest.approx(9, abs=1)] * (degrees == 9)
     if class_ == OBSTACLE:
         assert share(result.terrain, frame, OBSTACLE, GROUND) < missed
         assert share(result.terrain, frame, OBSTACLE, OBSTACLE) > 0.85
