@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -50,6 +51,11 @@ def segment(
     ValueError
         `ConfigError`, `RangeImageError` or another one, whose message says what is wrong.
 
+    Warns
+    -----
+    UserWarning
+        The planes say that up is not as stated, or not as of a level camera.
+
     Examples
     --------
     >>> result = rangeseg_ros.segment(depth, rangeseg_ros.Camera.from_fov(640, 480, 57))
@@ -62,6 +68,9 @@ def segment(
     else:
         image = RangeImage.from_depth(depth, camera, scale)
     result = Segmenter(config).segment(corrected(image, config))
+    if result.tilt:
+        told = 'up is not as stated, or not that of a level camera, see result.tilt'
+        warnings.warn(told, stacklevel=2)
     return replace(result, planes=with_roles(result.planes, config, result.up))
 
 

@@ -13,7 +13,7 @@ from recordings import SUFFIXES, Recording, depth_images, record
 
 from rangeseg_ros.core.sensing.camera import Camera, CameraWarning
 from rangeseg_ros.io.bag_writer import DepthBagWriter
-from rangeseg_ros.io.bags import DamagedBagError, DepthBag, open_frames
+from rangeseg_ros.io.bags import DamagedBagError, DepthBag
 from rangeseg_ros.io.cameras import read_camera, write_camera
 from rangeseg_ros.io.recordings import BagError
 from rangeseg_ros.messages.make import CLOUD
@@ -457,12 +457,23 @@ def test_clouds_are_taken_where_there_are_no_images_and_one_topic_or_the_one_tha
                 recording.messages.append((10 + n, topic, CLOUD, message))
         recording.write(tmp_path / f'{number}')
         recording.messages.clear()
-    with open_frames(tmp_path / '0', None, None) as bag:
+    with DepthBag(tmp_path / '0') as bag:
         assert next(iter(bag)).range_image().points[0, 0] == pytest.approx([1, 1, 1])
     with pytest.raises(BagError, match='several topics of point clouds: /a, /b'):
-        open_frames(tmp_path / '1', None, None)
+        DepthBag(tmp_path / '1')
     for number in '12':
-        with open_frames(tmp_path / number, '/b', None) as bag:
+        with DepthBag(tmp_path / number, '/b') as bag:
             assert next(iter(bag)).range_image().points[0, 0] == pytest.approx([2, 2, 2])
-    with open_frames(tmp_path / '2', None, None) as bag:
+    with DepthBag(tmp_path / '2') as bag:
         assert next(iter(bag)).camera is not None
+
+
+def test_clouds_are_replayed(tmp_path, run):
+    recording, camera = Recording(), Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
+    message = cloud((2 * camera.rays).astype('<f4'))
+    recording.messages.append((START, '/points', CLOUD, message))
+    recording.write(tmp_path / 'bag')
+    code, output, error = run('replay', tmp_path / 'bag', '--output', tmp_path / 'out')
+    assert (code, error) == (0, '') and '1 frames' in output
+    (labels,) = (tmp_path / 'out').glob('*_labels.png')
+    assert (cv2.imread(str(labels), cv2.IMREAD_UNCHANGED) == 1).all()

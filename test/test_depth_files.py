@@ -102,7 +102,7 @@ def test_what_is_none_is_refused_in_one_line(depth, tmp_path):
     np.savez(tmp_path / 'first.npz', Depth=np.ones(5), colour=np.ones((4, 5)))
     np.save(tmp_path / 'points.npy', np.ones((5, 3)))
     for name, words in (
-        ('unsized.ply', 'not an organised cloud'),
+        ('unsized.ply', 'each pixel of an organised cloud'),
         ('cut.ply', 'truncated'),
         ('text.ply', 'not a PLY file'),
         ('list.ply', 'vertices with lists'),
@@ -116,7 +116,7 @@ def test_what_is_none_is_refused_in_one_line(depth, tmp_path):
         ('colour.npy', r'points \(H, W, 3\), \(4, 5, 3\) uint8'),
         ('first.npz', r'\(5,\) float64'),
         ('row.npy', r'no depth \(H, W\) nor points'),
-        ('points.npy', '5 points, not an organised cloud'),
+        ('points.npy', '5 points, not one for each pixel'),
     ):
         with pytest.raises(ValueError, match=words):
             read_frame(tmp_path / name, Intrinsics(fov=60))
@@ -137,6 +137,7 @@ def test_folders(depth, tmp_path):
         folder.mkdir(parents=True)
     for name in ('2.png', '1.png'):
         cv2.imwrite(str(tum / 'depth' / name), depth)
+        (tum / 'depth' / f'._{name}').write_bytes(b'of the Finder')
         cv2.imwrite(str(tum / 'rgb' / name), np.zeros((48, 64, 3), np.uint8))
     (tum / 'depth.txt').write_text('# timestamp filename\n')
     assert files_in(tum) == [tum / 'depth/1.png', tum / 'depth/2.png']
@@ -164,6 +165,8 @@ def test_intrinsics_of_numbers():
     assert Intrinsics(focal=(60, None, None, None)).of((48, 64)) == CAMERA
     assert Intrinsics(focal=(60, 61, 0.0, 1)).of((48, 64)) == Camera(64, 48, 60, 61, 0, 1)
     assert Intrinsics(fov=90).of((48, 64)).fx == pytest.approx(32)
+    with pytest.raises(ValueError, match='between 0 and 180'):
+        Intrinsics(fov=0).of((48, 64))
     with pytest.raises(ValueError, match='--camera FILE, --fov DEGREES'):
         Intrinsics().of((48, 64))
 

@@ -72,6 +72,8 @@ def test_segment_compiles_before_the_first_image_and_for_its_parameters(folder, 
     (folder / 'params.yaml').write_text('method: normals')
     before = files(folder)
     options = '--output', 'out', '--params', 'params.yaml'
+    # Nothing for what cannot be read.
+    assert run('segment', 'params.yaml', *CAMERA, *options)[0] == 2 and not prepared
     assert run('segment', 'depth/2.png', *CAMERA, *options)[0] == 0
     assert prepared == [('normals', ('image',), before)]
 

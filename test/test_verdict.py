@@ -155,6 +155,17 @@ def test_millimetres_in_floats_are_told(seen):
     assert Segmenter().segment(image).verdict.reasons == ('millimetres in floats',)
 
 
+def test_what_is_no_depth_in_metres_has_no_ground(seen):
+    noise = np.random.default_rng(1).integers(500, 8000, seen.depth.shape).astype(np.uint16)
+    metres = np.round(seen.depth / 1000).astype(np.uint16)
+    for depth, told in ((noise, 'noise instead of depth'), (metres, 'scale improbable')):
+        result = Segmenter().segment(RangeImage.from_depth(depth, seen.camera))
+        assert told in result.verdict.reasons and result.verdict.invalid
+        assert result.ground is None and not result.terrain.any()
+    with pytest.warns(UserWarning, match='within 1 cm'):
+        RangeImage.from_depth(seen.depth / 1e6, seen.camera)
+
+
 @pytest.mark.parametrize(
     ('run', 'jump', 'share'), [(6, 1.06, 0.03), (4, 0.5, 0.02), (3, 0.5, 0), (6, 1.04, 0)]
 )

@@ -20,7 +20,7 @@ from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.distortion import DistortionMap
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.digest import result_key
-from rangeseg_ros.io.bags import DepthBag, open_frames
+from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.corrections import corrected, correction_files
 from rangeseg_ros.io.depth_files import files_of
 from rangeseg_ros.io.files import replacing
@@ -34,7 +34,7 @@ PART = 10
 class Source:
     """Frames of a recording: a bag of images or clouds, or a folder of images of one camera.
 
-    Of a folder, the camera and metres per unit are given, of a bag its topics, see `open_frames`.
+    Of a folder, the camera and metres per unit are given, of a bag its topics, see `DepthBag`.
     """
 
     path: Path
@@ -73,7 +73,7 @@ class Source:
                 yield frame.range_image()
 
     def _bag(self) -> DepthBag:
-        return open_frames(self.path, self.depth_topic, self.camera_topic)
+        return DepthBag(self.path, self.depth_topic, self.camera_topic)
 
 
 class Seen(NamedTuple):

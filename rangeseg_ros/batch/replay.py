@@ -236,7 +236,8 @@ def segment_frames(
     left out and counted by `source.lost`.
     """
     # Or the times of the first frame would be those of the compiler.
-    prepare(sequence.config, ('image',), report=lambda progress: None)
+    kinds = ('image',) if source.camera_topic else ('points',)
+    prepare(sequence.config, kinds, report=lambda progress: None)
     done = 0
     try:
         for frame in progress(source, len(source)) if progress else source:

@@ -16,7 +16,7 @@ from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.camera import CameraError
 from rangeseg_ros.core.sequence import with_roles
 from rangeseg_ros.io.corrections import corrected
-from rangeseg_ros.io.depth_files import CLOUDS, Intrinsics, files_in, read_frame, scale_of
+from rangeseg_ros.io.depth_files import Intrinsics, files_in, read_frame, scale_of
 
 # Outputs of the node that show what the files hold, so that they need the same kernels.
 _SHOWN = ('labels', 'planes', 'overlay', 'normals', 'terrain', 'stairs')
@@ -57,8 +57,8 @@ def command(
 ) -> None:
     """Segment DEPTH images or organised clouds into planes.
 
-    Files or folders of them: PNG, TIFF, EXR, .npy, .npz (integers in millimetres, floats in
-    metres), PCD and PLY, and folders as the benchmark of TUM has them (1/5000 m).
+    Files or folders of them: PNG, TIFF, PGM, PFM, EXR, .npy, .npz (integers in millimetres, floats
+    in metres), PCD and PLY, and folders as the benchmark of TUM has them (1/5000 m).
 
     Writes for each image <stem>_labels.png (16 bits, 0 = no plane), <stem>_planes.csv (a row for
     each plane, metres, x right, y down, z forward), <stem>_overlay.png, <stem>_terrain.png (0
@@ -74,10 +74,7 @@ def command(
     files = [name for name in FRAME_FILES if asked.get(name, True)]
     outputs = [frame_path(output, path.stem, kind) for path, _ in frames for kind in files]
     options.check_new(outputs, [path for path, _ in frames], overwrite)
-    clouds = any(path.suffix.lower() in CLOUDS for path, _ in frames)
-    kinds = ('image', 'points') if clouds else ('image',)
-    prepare(config, kinds, show, _SHOWN)
-    tilted = refused = 0
+    tilted, refused, prepared = 0, 0, set[str]()
     for path, scale in options.progress(frames, len(frames), 'image'):
         try:
             image = corrected(read_frame(path, intrinsics, scale), config)
@@ -87,11 +84,16 @@ def command(
             options.say(f'rangeseg: {path}: {one_line(error).removeprefix(f"{path}: ")}', err=True)
             refused += 1
             continue
+        kind = 'image' if image.camera else 'points'
+        if kind not in prepared:
+            prepare(config, (kind,), show, _SHOWN)
+            prepared.add(kind)
         result = segmenter.segment(image)
         result = replace(result, planes=with_roles(result.planes, config, result.up))
         write_frame(output, path.stem, image, result, files)
         if result.planes:
-            options.say(f'{path}: {len(result.planes)} planes, {result.ground or "in no unit"}')
+            ground = result.ground or 'in no known unit'
+            options.say(f'{path}: {len(result.planes)} planes, {ground}')
         else:
             options.say(f'{path}: no plane: {result.reason}')
         if not result.verdict.ok and image.valid.any():

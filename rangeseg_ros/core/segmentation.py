@@ -24,7 +24,7 @@ from rangeseg_ros.core.sensing.grid import GridEdges
 from rangeseg_ros.core.sensing.jump_edges import pixels_beside
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.core.sensing.verdict import Verdict, judge
+from rangeseg_ros.core.sensing.verdict import Verdict, judge, no_depth
 
 STATED = SensorModel.from_config(Config())
 """The sensor that the defaults describe."""
@@ -137,6 +137,7 @@ class Segmentation:
             'reason': self.reason,
             'sensor': str(self.sensor),
             'verdict': list(self.verdict.reasons),
+            'tilt': str(self.tilt or ''),
         }
 
     def to_pandas(self) -> Any:
@@ -226,8 +227,13 @@ class Segmentation:
 
     @cached_property
     def ground(self) -> Terrain | None:
-        """The ground and what interrupts it, worked out when read; None where none was asked."""
-        return self.survey.terrain() if isinstance(self.survey, Survey) else self.survey
+        """The ground and what interrupts it, worked out when read.
+
+        None where none was asked for, or the image is no depth in metres.
+        """
+        if not isinstance(self.survey, Survey):
+            return self.survey
+        return None if no_depth(self.survey.image) else self.survey.terrain()
 
     @cached_property
     def grid(self) -> GroundGrid | None:

@@ -30,7 +30,7 @@ class DepthBag(Closing):
     `path` is a directory or .mcap or .db3 file of a rosbag2, or a .bag file of ROS 1. By default
     the depth image is found by type and name, or encoding; its camera_info is the sibling topic,
     or the only one there is. `raw` says that the images are raw whatever the name of their topic
-    says, `clouds` that the frames are the clouds on `depth_topic`, which need no camera.
+    says. Where no topic has images, the frames are the only point clouds, which need no camera.
 
     `lost` counts why frames were left out while iterating; `damage` is for those who iterate to
     note what ended it.
@@ -46,7 +46,6 @@ class DepthBag(Closing):
         depth_topic: str | None = None,
         camera_topic: str | None = None,
         raw: bool = False,
-        clouds: bool = False,
     ) -> None:
         self.path = path
         self.lost: Counter[str] = Counter()
@@ -54,9 +53,16 @@ class DepthBag(Closing):
         self.depth_topic, self.camera_topic = depth_topic or '', camera_topic or ''
         self._raw, self._first_camera = raw, None
         self._recording = Recording(path)
-        if clouds:
-            return
         try:
+            types, counts = self._recording.types, self._recording.counts
+            clouds = sorted(name for name in types if types[name] == CLOUD and counts[name])
+            if clouds and not depth_topic and set(IMAGES).isdisjoint(types.values()):
+                if len(clouds) > 1:
+                    raise BagError(f'{path}: several topics of point clouds: {", ".join(clouds)}')
+                self.depth_topic = clouds[0]
+            if self.depth_topic in clouds:
+                self.camera_topic = ''
+                return
             self.depth_topic = depth_topic or self._find_depth_topic()
             self._require(self.depth_topic, 'depth image', IMAGES)
             self.camera_topic = camera_topic or self._find_camera_topic()
@@ -190,20 +196,6 @@ class DepthBag(Closing):
         listed = ', '.join(f'{name} [{kind}]' for name, kind in topics) or 'none'
         damage = self._recording.cut
         return f'topics: {listed}' + (f' (damaged: {damage})' if damage else '')
-
-
-def open_frames(path: Path, topic: str | None, camera_topic: str | None) -> DepthBag:
-    """Frames of a recording: those on `topic`, else depth images, else the only point clouds."""
-    with Recording(path) as recording:
-        types, counts = recording.types, recording.counts
-    clouds = sorted(name for name, kind in types.items() if kind == CLOUD and counts[name])
-    if topic in clouds:
-        return DepthBag(path, topic, clouds=True)
-    if topic or not clouds or set(IMAGES) & set(types.values()):
-        return DepthBag(path, topic, camera_topic)
-    if len(clouds) > 1:
-        raise BagError(f'{path}: several topics of point clouds: {", ".join(clouds)}')
-    return DepthBag(path, clouds[0], clouds=True)
 
 
 def _sibling_camera_info(image_topic: str) -> str:

@@ -29,7 +29,8 @@ _TUM_SCALE = 1 / 5000
 def files_of(folder: Path, suffixes: Collection[str] = IMAGES) -> list[Path]:
     """Files of a folder that end so, in the order of their names, 2 before 10."""
     files = (path for path in folder.iterdir() if path.suffix.lower() in suffixes)
-    return sorted(files, key=natural_order)
+    # Beside each file, macOS leaves a hidden one of its name.
+    return sorted((path for path in files if path.name[0] != '.'), key=natural_order)
 
 
 def files_in(path: Path) -> list[Path]:
@@ -67,7 +68,7 @@ class Intrinsics:
         height, width = shape[:2]
         if self.camera:
             return self.camera
-        if self.fov:
+        if self.fov is not None:
             return Camera.from_fov(width, height, self.fov)
         if not self.focal:
             raise CameraError(

@@ -75,7 +75,7 @@ def read_bytes(path: Path, most: int | None = None) -> bytes:
     try:
         check_regular(path)
         if most is not None and path.stat().st_size > most:
-            raise FileError(f'{path}: too large for such a file')
+            raise FileError(f'{path}: too large, or no such file as is expected here')
         return path.read_bytes()
     except OSError as error:
         raise FileError(f'{path}: {error.strerror}') from None

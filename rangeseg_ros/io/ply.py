@@ -62,5 +62,7 @@ def organised(
     """Points (N, 3) of a file as (H, W, 3); FileError unless N is H x W of a `shape` (H, W)."""
     if shape is None or len(points) != shape[0] * shape[1]:
         known = f'the camera has {shape[1]}x{shape[0]}' if shape else 'no --camera tells its size'
-        raise FileError(f'{path}: {len(points)} points, not an organised cloud; {known}')
+        raise FileError(
+            f'{path}: {len(points)} points, not one for each pixel of an organised cloud; {known}'
+        )
     return points.reshape(*shape, 3)

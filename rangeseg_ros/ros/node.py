@@ -211,7 +211,7 @@ class SegmentPlanes(LifecycleNode):
 def _refuse(error: Exception) -> NoReturn:
     rclpy.try_shutdown()
     # The place in rcl's own sources says nothing to users.
-    problem = str(error).split(', at ')[0]
+    problem = str(error).split(', at ')[0].replace("'DOUBLE'", "'DOUBLE', such as 3.0")
     if problem.startswith('['):
         problem = f'unknown ROS arguments {problem}'
     print(f'segment_planes: {problem}', file=sys.stderr)

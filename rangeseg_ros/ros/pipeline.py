@@ -176,6 +176,7 @@ class Pipeline:
         self._statistics.no_terrain = lost
         if lost:
             found = replace(found, survey=None)
+            self._node.get_logger().warning(lost, throttle_duration_sec=5.0)
         self._tell(sequence, at)
         segmented.ticks.append(time.perf_counter())
         return segmented._replace(found=found, at=at), sequence

@@ -141,7 +141,7 @@ def _upright(
         # Without a height the ground is what the camera stands on: a table tells by its size.
         size = float(np.ptp(place[1:, reached], axis=1).max()) if seen else 0.0
         sure = size >= FURNITURE
-        told = f'{size:.2f} m of a surface may be a table: state sensor_height'
+        told = f'the {size:.2f} m of level surface in view may be a table: state sensor_height'
         reason = told if size > config.least_step else ''
     if seen is None or not sure:
         confidence = seen.confidence if seen and height_sd > 0 else 0.0

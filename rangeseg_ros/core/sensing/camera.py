@@ -27,7 +27,7 @@ class CameraWarning(UserWarning):
 
 
 class CameraError(ValueError):
-    """Intrinsics that no camera has, or that are not known to the end."""
+    """Intrinsics that no camera has, or of which something is not known."""
 
 
 @dataclass(frozen=True)

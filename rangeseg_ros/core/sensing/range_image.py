@@ -23,6 +23,7 @@ class UnitWarning(UserWarning):
 
 
 FAR = 65.0  # the farthest that 16 bits of millimetres tell, metres
+NEAR = 0.01  # nearer than any depth camera measures, metres
 NOT_MEASURED = 65535  # what drivers and data sets write for it beside 0
 
 
@@ -92,17 +93,18 @@ class RangeImage:
         Warns
         -----
         UnitWarning
-            More than half of the pixels are farther than 16 bits of millimetres reach. Or there
-            are 8 bits and no scale, as of a picture of depth.
+            More than half of the pixels are farther than 16 bits of millimetres reach, or nearer
+            than any camera measures. Or there are 8 bits and no scale, as of a picture of depth.
         """
         array, hidden = _unmasked(depth)
         if array.ndim != 2:
             given = array.shape if array.ndim else f'{depth!r:.60}'
             hint = '; points need no camera' if array.shape[2:] == (3,) else ''
+            hint = hint if array.ndim else '; cv2.imread(path, cv2.IMREAD_UNCHANGED) reads files'
             raise RangeImageError(f'depth image must be of shape (H, W), not {given}{hint}')
         if not isinstance(camera, Camera):
             raise RangeImageError(
-                'camera must be a Camera(width, height, fx, fy, cx, cy) or of '
+                'camera must be a Camera(width, height, fx, fy, cx, cy), Camera.from_fov(...) or '
                 f'camera_from_matrices(...), not of type {type(camera).__name__}'
             )
         integers = array.dtype.kind in 'iu'
@@ -159,7 +161,7 @@ class RangeImage:
         Warns
         -----
         UnitWarning
-            More than half of the points are farther than depth images in millimetres reach.
+            More than half of the points are as far, or as near, as no depth camera measures.
         """
         array, hidden = _unmasked(points)
         if array.ndim != 3 or array.shape[2] != 3 or array.dtype.kind != 'f' or not array.size:
@@ -196,18 +198,12 @@ class RangeImage:
             raise RangeImageError(f'the mask is {width}x{height}, the image {columns}x{rows}')
         return replace(self, inverse=np.where(body, np.float32(0), self.inverse), body=body)
 
-    @property
-    def beyond_reach(self) -> bool:
-        """Whether more than half of what was measured is beyond any depth camera's reach."""
-        return bool(2 * np.count_nonzero(self.inverse[self.valid] < 1 / FAR) > self.valid.sum())
-
     def _doubt_unit(self, measured: str) -> None:
-        if self.beyond_reach:
-            warnings.warn(
-                f'more than half of the {measured} are beyond {FAR:.0f} m: are they in metres?',
-                UnitWarning,
-                stacklevel=3,
-            )
+        known = self.inverse[self.valid]
+        for off, where in ((known < 1 / FAR, 'beyond 65 m'), (known > 1 / NEAR, 'within 1 cm')):
+            if 2 * np.count_nonzero(off) > known.size:
+                told = f'more than half of the {measured} are {where}: are they in metres?'
+                warnings.warn(told, UnitWarning, stacklevel=3)
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.enlargement import SIGNIFICANT, enlargement
-from rangeseg_ros.core.sensing.range_image import FAR, RangeImage
+from rangeseg_ros.core.sensing.range_image import FAR, NEAR, RangeImage
 from rangeseg_ros.core.significance import OUTLIER, quantile
 
 ODDS = float(np.log(1e4))
@@ -71,11 +71,8 @@ def judge(
     """
     if not image.valid.any():
         return Verdict(('nothing measured',), ('Nothing in the image is measured.',))
-    found: dict[str, str] = {}
-    rows = image.inverse[::4]
-    both = (rows[:, 1:] > 0) & (rows[:, :-1] > 0)
-    if both.any() and OUTLIER * np.abs(np.diff(rows)[both]).mean() > np.median(rows[rows > 0]):
-        found['noise instead of depth'] = 'Neighbouring pixels have nothing in common.'
+    found = no_depth(image)
+    unit_told = bool(found)
     if cells := enlargement(image):
         found[f'enlarged x {cells.factor}'] = (
             f'Each measurement fills {cells.factor} x {cells.factor} pixels: the image was '
@@ -94,12 +91,7 @@ def judge(
             'Surfaces are flat only if the values are distances from the camera, not along its '
             'axis: multiply them by 1 / |ray|.'
         )
-    if image.beyond_reach:
-        found['millimetres in floats'] = (
-            f'More than half of the image is beyond {FAR:.0f} m: the values are not in metres '
-            '(scale 0.001?).'
-        )
-    elif factor := improbable_scale(image):
+    if not unit_told and (factor := improbable_scale(image)):
         hint, times = ' (TUM: 0.0002)', f'{factor:g} times too far'
         if factor < 1:
             hint, times = '', f'{1 / factor:g} times too near'
@@ -121,6 +113,28 @@ def judge(
             'parameters are used.'
         )
     return Verdict(tuple(found), tuple(found.values()))
+
+
+def no_depth(image: RangeImage) -> dict[str, str]:
+    """Why an image is no depth in metres at all, as far as that is quick to see."""
+    rows, found = image.inverse[::8], dict[str, str]()
+    both = (rows[:, 1:] > 0) & (rows[:, :-1] > 0)
+    if not both.any():
+        return found
+    typical = float(np.median(rows[rows > 0]))
+    if OUTLIER * np.abs(np.diff(rows)[both]).mean() > typical:
+        found['noise instead of depth'] = 'Neighbouring pixels have nothing in common.'
+    if typical < 1 / FAR:
+        found['millimetres in floats'] = (
+            f'Half of the image is beyond {FAR:.0f} m: the values are not in metres (of '
+            'millimetres the scale is 0.001).'
+        )
+    if typical > 1 / NEAR:
+        found['scale improbable'] = (
+            f'Half of the image is nearer than {100 * NEAR:.0f} cm, which no depth camera '
+            'measures: check the depth scale.'
+        )
+    return found
 
 
 def filled_share(image: RangeImage) -> float:
