@@ -44,18 +44,12 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _checked(
-    context: click.Context, parameter: click.Parameter, values: tuple[float, ...]
-) -> tuple[float, ...]:
-    return tuple(check_tolerance(value) for value in values or TOLERANCES)
-
-
 tolerance: Callable[..., Any] = click.option(
     '--tolerance',
     'tolerances',
     type=float,
     multiple=True,
-    callback=_checked,
+    callback=lambda context, option, values: tuple(map(check_tolerance, values or TOLERANCES)),
     metavar='T...',
     help=f'Overlap from which regions match, in (0.5, 1]; several may follow.  '
     f'[default: {" ".join(map(str, TOLERANCES))}]',

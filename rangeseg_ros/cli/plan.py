@@ -30,12 +30,7 @@ from rangeseg_ros.tasks import Failure
     show_default=True,
     help='Side of a cell of map.pgm, metres.',
 )
-@options.topics
-@options.overwrite
-@options.jobs
-@recordings.scheduler
-@options.config('exact', 'fixed_frame')
-@click.pass_context
+@recordings.of_results
 def command(
     ctx: click.Context,
     paths: tuple[Path, ...],

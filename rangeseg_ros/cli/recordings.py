@@ -24,6 +24,15 @@ scheduler: Callable[..., Any] = click.option(
     help='Run on the workers of this Dask cluster, e.g. tcp://host:8786; needs the extra dask. '
     'The workers see BAGs and output under the same names.',
 )
+of_results = options.together(
+    options.topics,
+    options.overwrite,
+    options.jobs,
+    scheduler,
+    options.config('exact', 'fixed_frame'),
+    click.pass_context,
+)
+"""Options of commands that write results of recordings."""
 
 
 class RecordingTask(Protocol[R_co]):

@@ -21,9 +21,7 @@ from rangeseg_ros.tasks import Failure
 @click.command()
 @recordings.argument
 @options.output_folder()
-@options.topics
 @options.raw
-@options.overwrite
 @click.option(
     '--topic',
     'topics',
@@ -39,10 +37,7 @@ from rangeseg_ros.tasks import Failure
     help='Also write <frame>_<stamp>_terrain.png and _height.tiff, ground.csv and stairs.csv.',
 )
 @click.option('--copy', is_flag=True, help='Copy the topics of the recording into the bag.')
-@options.jobs
-@recordings.scheduler
-@options.config('exact', 'fixed_frame')
-@click.pass_context
+@recordings.of_results
 def command(
     ctx: click.Context,
     paths: tuple[Path, ...],

@@ -259,18 +259,9 @@ def _check_names(kind: type[Config], names: Iterable[object]) -> None:
 
 # Former names of parameters, and their names now.
 RENAMED = {'sensor_height_noise': 'sensor_height_sd', 'up_noise': 'up_sd'}
-# Former parameters that nothing reads any more, and why.
-DROPPED = {
-    'directions': 'one kind is as good as another',
-    'cycles': 'exact goes on until no label helps',
-    'flatness': 'plane_probability decides what is a plane',
-    'noise_regions': 'min_pixels leaves out what is small',
-    'moves': 'exact expands labels: swaps take as long and leave a higher energy',
-    'refits': 'planes are fitted to the final labels',
-    'track_memory': 'track_time says it in seconds',
-    'warm_start': 'no frame depends on those before',
-}
-
+# Former parameters that nothing reads any more; CHANGELOG.rst has the reasons.
+DROPPED = ('directions', 'cycles', 'flatness', 'noise_regions', 'moves', 'refits')
+DROPPED += ('track_memory', 'warm_start')
 
 NAMES = frozenset((*RENAMED, *DROPPED, *Config.__dataclass_fields__))
 """What parameters are, or were, called."""
@@ -279,8 +270,7 @@ NAMES = frozenset((*RENAMED, *DROPPED, *Config.__dataclass_fields__))
 def _renamed(mapping: Mapping[str, Any]) -> dict[str, Any]:
     """Names and values of parameters as they are called now."""
     result = {name: value for name, value in mapping.items() if name not in (*RENAMED, *DROPPED)}
-    dropped = {former: reason for former, reason in DROPPED.items() if former in mapping}
-    said = [f'{former} is not read any more: {reason}' for former, reason in dropped.items()]
+    said = [f'{name} is not read any more (CHANGELOG.rst)' for name in DROPPED if name in mapping]
     for former, name in RENAMED.items():
         if former in mapping:
             result.setdefault(name, mapping[former])

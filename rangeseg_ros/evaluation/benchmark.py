@@ -6,7 +6,7 @@ import math
 import multiprocessing
 import re
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,7 +77,10 @@ def _measure(
     laps = [_laps(segmenter, frames, path) for path in progress(order, len(order))]
     counted = laps[WARM_UP:]
     cpu = [lap.pop('cpu') for lap in counted]
-    stages = {name: _figures([lap[name] for lap in counted]) for name in counted[0]}
+    stages = {}
+    for name in counted[0]:
+        median, high = np.percentile([lap[name] for lap in counted], [50, 95])
+        stages[name] = {'median_ms': float(median), 'p95_ms': float(high)}
     totals = [lap['total'] for lap in counted]
     return {
         'method': config.method,
@@ -108,13 +111,6 @@ def _laps(segmenter: Segmenter, frames: Frames, path: Path) -> dict[str, float]:
         **timings,
         'total': 1000 * (end - begin),
         'cpu': 1000 * (end_cpu - begin_cpu),
-    }
-
-
-def _figures(milliseconds: Sequence[float]) -> dict[str, float]:
-    return {
-        'median_ms': float(np.median(milliseconds)),
-        'p95_ms': float(np.percentile(milliseconds, 95)),
     }
 
 

@@ -62,12 +62,9 @@ def _environment() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {'svg': _svg, 'jpeg': _jpeg}
+    environment.filters['svg'] = lambda text: _data('image/svg+xml', text.encode())
+    environment.filters['jpeg'] = _jpeg
     return environment
-
-
-def _svg(text: str) -> str:
-    return _data('image/svg+xml', text.encode())
 
 
 def _jpeg(path: Path) -> str:
