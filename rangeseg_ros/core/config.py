@@ -260,8 +260,8 @@ def _check_names(kind: type[Config], names: Iterable[object]) -> None:
 # Former names of parameters, and their names now.
 RENAMED = {'sensor_height_noise': 'sensor_height_sd', 'up_noise': 'up_sd'}
 # Former parameters that nothing reads any more; CHANGELOG.rst has the reasons.
-DROPPED = ('directions', 'cycles', 'flatness', 'noise_regions', 'moves', 'refits')
-DROPPED += ('track_memory', 'warm_start')
+DROPPED = ['directions', 'cycles', 'flatness', 'noise_regions', 'moves', 'refits']
+DROPPED += ['track_memory', 'warm_start']
 
 NAMES = frozenset((*RENAMED, *DROPPED, *Config.__dataclass_fields__))
 """What parameters are, or were, called."""
