@@ -468,6 +468,18 @@ def test_clouds_are_taken_where_there_are_no_images_and_one_topic_or_the_one_tha
         assert next(iter(bag)).camera is not None
 
 
+def test_images_without_camera_info_take_a_file(tmp_path, run):
+    recording = Recording()
+    recording.add_image(START, depth_images(1)[0])
+    recording.write(tmp_path / 'bag')
+    write_camera(tmp_path / 'camera.yaml', Camera(64, 48, 50.0, 50.0, 31.5, 23.5))
+    replay = 'replay', tmp_path / 'bag', '--output', tmp_path / 'out'
+    code, _, error = run(*replay)
+    assert code == 2 and 'replay takes --camera' in error
+    assert 'image_rect\n' in run(*replay, '--camera', tmp_path / 'camera.yaml')[1]
+    assert (tmp_path / 'out/planes.csv').exists()
+
+
 def test_clouds_are_replayed(tmp_path, run):
     recording, camera = Recording(), Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
     message = cloud((2 * camera.rays).astype('<f4'))

@@ -20,10 +20,10 @@ from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.placement import Placement
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.segmentation import Segmentation
+from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.digest import result_key
-from rangeseg_ros.drawing import colours
 from rangeseg_ros.io import tables
 from rangeseg_ros.io.bags import DamagedBagError, DepthBag
 from rangeseg_ros.io.corrections import corrected, correction_files
@@ -77,6 +77,7 @@ class Replay:
     config: Config
     depth_topic: str | None = None
     camera_topic: str | None = None
+    camera: Camera | None = None
     topics: tuple[str, ...] = ('labels', 'planes', 'markers')
     copy: bool = False
     raw: bool = False
@@ -89,7 +90,7 @@ class Replay:
         with self._open() as source:
             if self.copy:
                 open_source(self.recording).close()
-            return f'{source.depth_topic}, {source.camera_topic}'
+            return ', '.join(filter(None, (source.depth_topic, source.camera_topic)))
 
     def run(self, progress: Progress | None = None) -> Outcome:
         """Write the results, or find that they are there; BagError as `check`."""
@@ -125,7 +126,8 @@ class Replay:
         return outcome
 
     def _open(self) -> DepthBag:
-        return DepthBag(self.recording, self.depth_topic, self.camera_topic, self.raw)
+        topics = self.depth_topic, self.camera_topic
+        return DepthBag(self.recording, *topics, self.raw, self.camera)
 
     def _key(self) -> str:
         """Digest of all that the results depend on: code, parameters, the recording's files."""
@@ -197,8 +199,7 @@ class _Results:
             rows = [[*tables.values(p, without), tables.parts_value(p)] for p in mapped.planes]
             columns = [*tables.columns(MapPlane, without), 'parts']
             tables.write_table(folder / 'map.csv', columns, rows)
-            shades = colours([plane.id for plane in mapped.planes])
-            write_mesh(folder / 'map.ply', mapped.planes, shades)
+            write_mesh(folder / 'map.ply', mapped.planes)
         damage = [source.damage, source.loss()]
         if lost := self.bag.lost:
             reason, count = lost.most_common(1)[0]
@@ -236,7 +237,7 @@ def segment_frames(
     left out and counted by `source.lost`.
     """
     # Or the times of the first frame would be those of the compiler.
-    kinds = ('image',) if source.camera_topic else ('points',)
+    kinds = ('image',) if source.has_images else ('points',)
     prepare(sequence.config, kinds, report=lambda progress: None)
     done = 0
     try:

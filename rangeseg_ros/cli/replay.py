@@ -11,6 +11,7 @@ import click
 from rangeseg_ros.batch.replay import Outcome, Replay
 from rangeseg_ros.cli import options, recordings
 from rangeseg_ros.cli.errors import one_line
+from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.files import NotReplacedError
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.report.page import page_kind
@@ -21,6 +22,7 @@ from rangeseg_ros.tasks import Failure
 @click.command()
 @recordings.argument
 @options.output_folder()
+@options.camera()
 @options.raw
 @click.option(
     '--topic',
@@ -44,6 +46,7 @@ def command(
     output: Path,
     overwrite: bool,
     topics: tuple[str, ...],
+    camera_file: Path | None,
     jobs: int | None,
     scheduler: str | None,
     **settings: Any,
@@ -66,8 +69,9 @@ def command(
     other, and the exit code is 2.
     """
     settings |= {'topics': tuple(name for name in OUTPUTS if name in topics)}
+    camera = read_camera(camera_file, settings['raw']) if camera_file else None
     tasks = [
-        Replay(bag, folder, overwrite=overwrite, **settings)
+        Replay(bag, folder, overwrite=overwrite, camera=camera, **settings)
         for bag, folder in recordings.with_folders(paths, output, scheduler)
     ]
     # All are opened, and so checked, before anything is written.

@@ -31,6 +31,7 @@ class DepthBag(Closing):
     the depth image is found by type and name, or encoding; its camera_info is the sibling topic,
     or the only one there is. `raw` says that the images are raw whatever the name of their topic
     says. Where no topic has images, the frames are the only point clouds, which need no camera.
+    `camera` is that of images without a camera_info.
 
     `lost` counts why frames were left out while iterating; `damage` is for those who iterate to
     note what ended it.
@@ -46,12 +47,13 @@ class DepthBag(Closing):
         depth_topic: str | None = None,
         camera_topic: str | None = None,
         raw: bool = False,
+        camera: Camera | None = None,
     ) -> None:
         self.path = path
         self.lost: Counter[str] = Counter()
         self.damage = ''
         self.depth_topic, self.camera_topic = depth_topic or '', camera_topic or ''
-        self._raw, self._first_camera = raw, None
+        self._raw, self._first_camera = raw, camera
         self._recording = Recording(path)
         try:
             types, counts = self._recording.types, self._recording.counts
@@ -60,14 +62,16 @@ class DepthBag(Closing):
                 if len(clouds) > 1:
                     raise BagError(f'{path}: several topics of point clouds: {", ".join(clouds)}')
                 self.depth_topic = clouds[0]
-            if self.depth_topic in clouds:
+            self.has_images = self.depth_topic not in clouds
+            if not self.has_images:
                 self.camera_topic = ''
                 return
             self.depth_topic = depth_topic or self._find_depth_topic()
             self._require(self.depth_topic, 'depth image', IMAGES)
-            self.camera_topic = camera_topic or self._find_camera_topic()
-            self._require(self.camera_topic, 'camera_info', (CAMERA_INFO,))
-            self._first_camera = self._first(self.camera_topic, self._camera)
+            if camera is None:
+                self.camera_topic = camera_topic or self._find_camera_topic()
+                self._require(self.camera_topic, 'camera_info', (CAMERA_INFO,))
+                self._first_camera = self._first(self.camera_topic, self._camera)
             # There is a frame that can be read.
             self._first(self.depth_topic, DepthFrame.range_image, self)
         except BaseException:
@@ -183,7 +187,8 @@ class DepthBag(Closing):
         sibling = _sibling_camera_info(self.depth_topic)
         if sibling not in there and len(there) != 1:
             raise BagError(
-                f'{self.path}: no camera_info for {self.depth_topic}; {self._topics_there_are()}'
+                f'{self.path}: no camera_info for {self.depth_topic} (replay takes --camera); '
+                + self._topics_there_are()
             )
         return sibling if sibling in there else there[0]
 

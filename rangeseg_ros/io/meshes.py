@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from rangeseg_ros.core.mapping.plane_map import MapPlane
+from rangeseg_ros.drawing import colours
 from rangeseg_ros.io.files import replacing
 
 _HEADER = """ply
@@ -27,11 +25,12 @@ end_header
 """
 
 
-def write_mesh(path: Path, planes: Sequence[MapPlane], colours: NDArray[np.uint8]) -> None:
-    """Write the outlines of planes, all parts with their holes, as triangles in colours (N, 3)."""
+def write_mesh(path: Path, planes: Sequence[MapPlane]) -> None:
+    """Write the outlines of planes, all parts with their holes, as triangles in their colours."""
     vertices: list[str] = []
     faces: list[str] = []
-    for plane, colour in zip(planes, colours.tolist(), strict=True):
+    shades = colours([plane.id for plane in planes]).tolist()
+    for plane, colour in zip(planes, shades, strict=True):
         corners, triangles = plane.mesh()
         rgb = ' '.join(map(str, colour))
         faces += ['3 {} {} {}'.format(*t) for t in len(vertices) + triangles]

@@ -36,7 +36,7 @@ def plan_files() -> dict[str, Callable[[Path, FloorPlan], None]]:
         'plan.geojson': write_geojson,
         'map.pgm': _write_pgm,
         'map.yaml': _write_yaml,
-        'map.ply': _write_ply,
+        'map.ply': lambda path, plan: write_mesh(path, plan.planes),
         'map.glb': _write_glb,
     }
 
@@ -164,10 +164,6 @@ def _write_yaml(path: Path, plan: FloorPlan) -> None:
         f'resolution: {plan.resolution:g}\norigin: [{x:.6g}, {y:.6g}, 0.0]\nnegate: 0\n'
         f'occupied_thresh: {_OCCUPIED_THRESHOLD}\nfree_thresh: {_FREE_THRESHOLD}\n'
     )
-
-
-def _write_ply(path: Path, plan: FloorPlan) -> None:
-    write_mesh(path, plan.planes, colours([plane.id for plane in plan.planes]))
 
 
 def _write_glb(path: Path, plan: FloorPlan) -> None:

@@ -52,7 +52,8 @@ def write_calibration(
         walls.append((frame, planes, [_rms(image) for image in residuals], _images(pictures)))
     ninths = [
         (_rms(a), _rms(b), float(np.median(c)))
-        for a, b, c in zip(*map(_ninths, (offset, deviation, views)), strict=True)
+        for rows in zip(*(np.array_split(f, 3) for f in (offset, deviation, views)), strict=True)
+        for a, b, c in zip(*(np.array_split(part, 3, axis=1) for part in rows), strict=True)
     ]
     write_page(
         path,
@@ -72,11 +73,6 @@ def write_calibration(
 def _extent(field: NDArray[np.float32]) -> float:
     """Where the colours of a field end."""
     return float(np.quantile(np.abs(field), 0.99)) or 1e-6
-
-
-def _ninths(field: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-    """Three by three parts of a field, row by row; fields may differ in size."""
-    return [part for rows in np.array_split(field, 3) for part in np.array_split(rows, 3, axis=1)]
 
 
 def _rms(field: NDArray[np.float32]) -> float:
