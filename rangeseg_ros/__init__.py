@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rangeseg_ros.core.sensing.camera import CameraError as CameraError
     from rangeseg_ros.core.sensing.range_image import RangeImage as RangeImage
     from rangeseg_ros.core.sensing.range_image import RangeImageError as RangeImageError
+    from rangeseg_ros.core.sensing.range_image import UnitWarning as UnitWarning
     from rangeseg_ros.core.sequence import SequenceSegmenter as SequenceSegmenter
     from rangeseg_ros.extras import MissingExtraError as MissingExtraError
     from rangeseg_ros.io.cameras import camera_from_calibration as camera_from_calibration
@@ -35,7 +36,7 @@ _HOMES = {
     'core.segmentation': ('Segmentation',),
     'core.segmenter': ('Segmenter',),
     'core.sensing.camera': ('Camera', 'CameraError'),
-    'core.sensing.range_image': ('RangeImage', 'RangeImageError'),
+    'core.sensing.range_image': ('RangeImage', 'RangeImageError', 'UnitWarning'),
     'core.sequence': ('SequenceSegmenter',),
     'extras': ('MissingExtraError',),
     'io.cameras': ('camera_from_calibration',),
