@@ -150,7 +150,7 @@ def test_a_kinect_in_the_wrong_unit_is_told(seen, unit):
 
 
 def test_millimetres_in_floats_are_told(seen):
-    with pytest.warns(UserWarning, match='65 m'):
+    with pytest.warns(UserWarning, match='65.0 m'):
         image = RangeImage.from_depth(seen.depth.astype(float), seen.camera)
     assert Segmenter().segment(image).verdict.reasons == ('millimetres in floats',)
 
@@ -162,7 +162,7 @@ def test_what_is_no_depth_in_metres_has_no_ground(seen):
         result = Segmenter().segment(RangeImage.from_depth(depth, seen.camera))
         assert told in result.verdict.reasons and result.verdict.invalid
         assert result.ground is None and not result.terrain.any()
-    with pytest.warns(UserWarning, match='within 1 cm'):
+    with pytest.warns(UserWarning, match='below 0.01 m'):
         RangeImage.from_depth(seen.depth / 1e6, seen.camera)
 
 

@@ -200,9 +200,9 @@ class RangeImage:
 
     def _doubt_unit(self, measured: str) -> None:
         known = self.inverse[self.valid]
-        for off, where in ((known < 1 / FAR, 'beyond 65 m'), (known > 1 / NEAR, 'within 1 cm')):
+        for off, far in ((known < 1 / FAR, f'beyond {FAR}'), (known > 1 / NEAR, f'below {NEAR}')):
             if 2 * np.count_nonzero(off) > known.size:
-                told = f'more than half of the {measured} are {where}: are they in metres?'
+                told = f'more than half of the {measured} are {far} m: are they in metres?'
                 warnings.warn(told, UnitWarning, stacklevel=3)
 
     @property
