@@ -7,6 +7,7 @@ import pytest
 
 from rangeseg_ros import Config, RangeImage
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN
+from rangeseg_ros.core.ground.grid import GroundMemory
 from rangeseg_ros.core.ground.points import thinned
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sequence import SequenceSegmenter
@@ -90,6 +91,14 @@ def test_without_poses_the_grid_is_of_one_image_and_in_its_frame():
     grid = drive.grid(0, 1, (FLOOR, LANDING))
     assert grid.frame == ''
     assert OBSTACLE not in grid.classes and (grid.classes == GROUND).sum() > 300
+
+
+def test_a_height_is_remembered_as_long_as_planes_are():
+    memory = GroundMemory(Config(track_time=3.0))
+    memory.keep_height(1.2, 10**9)
+    assert [memory.recall_height(int(s * 1e9)) for s in (1, 3.9, 4.1)] == [1.2, 1.2, 0]
+    memory.forget()
+    assert memory.recall_height(10**9) == 0
 
 
 def test_time_that_goes_back_forgets():

@@ -64,6 +64,15 @@ def test_quantisation_shows_beside_steps_of_several_quanta():
     assert found == (pytest.approx(1e-3, rel=1e-3), 0)
 
 
+@pytest.mark.parametrize('step', [0.01, 0.02])
+def test_errors_of_what_is_only_rounded_are_those_of_rounding(step):
+    depth = np.rint(1 / three_planes() / step) * step
+    sensor = sensor_of(1 / depth)
+    assert sensor.range_quantum == pytest.approx(step, rel=1e-3) and sensor.quantum == 0
+    errors = sensor.range_noise, sensor.range_distortion
+    assert errors == pytest.approx((step / 12**0.5,) * 2, rel=0.01)
+
+
 def test_the_standard_error_of_the_noise_is_what_it_scatters_by():
     found = []
     for seed in range(12):
