@@ -9,11 +9,12 @@ from clouds import cloud_of
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
-from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN
+from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN, cells_of
 from rangeseg_ros.core.ground.points import drops, outlines, unseen
 from rangeseg_ros.core.ground.reach import reach
 from rangeseg_ros.core.ground.terrain import terrain_of
 from rangeseg_ros.core.segmentation import STATED
+from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import SequenceSegmenter, with_roles
 from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.sensors.kinect import Kinect
@@ -114,6 +115,15 @@ def test_a_curb_is_an_obstacle_as_a_whole_though_its_side_fades_with_distance():
     result = Segmenter(config).segment(RangeImage.from_depth(frame.depth, sensor.camera))
     assert share(result.terrain, frame, OBSTACLE, OBSTACLE) > 0.95
     assert share(result.terrain, frame, GROUND, GROUND) > 0.98
+
+
+def test_holes_are_no_scatter_of_cells():
+    up, sensor = np.array([0, -np.cos(0.6), -np.sin(0.6)]), SensorModel.from_config(Config())
+    inverse = -(CAMERA.rays @ up).astype(np.float32)
+    inverse[(inverse < 0.1) | (np.random.default_rng(0).random(inverse.shape) < 0.3)] = 0
+    cells = cells_of(RangeImage(CAMERA.rays, inverse, CAMERA), up, sensor)
+    seen = cells.inverse > 0
+    assert seen.mean() > 0.8 and (cells.variance[seen] > 0).all()
 
 
 @pytest.mark.parametrize(('degrees', 'missed'), [(9, 0.0), (15, 0.1), (18, 0.01)])
