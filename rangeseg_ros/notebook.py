@@ -69,8 +69,7 @@ def segment(
         image = RangeImage.from_depth(depth, camera, scale)
     result = Segmenter(config).segment(corrected(image, config))
     if result.tilt:
-        told = 'up is not as stated, or not that of a level camera, see result.tilt'
-        warnings.warn(told, stacklevel=2)
+        warnings.warn('up is not as stated, or as of a level camera: result.tilt', stacklevel=2)
     return replace(result, planes=with_roles(result.planes, config, result.up))
 
 

@@ -92,8 +92,7 @@ def command(
         result = replace(result, planes=with_roles(result.planes, config, result.up))
         write_frame(output, path.stem, image, result, files)
         if result.planes:
-            ground = result.ground or 'in no known unit'
-            options.say(f'{path}: {len(result.planes)} planes, {ground}')
+            options.say(f'{path}: {len(result.planes)} planes, {result.ground or "in no unit"}')
         else:
             options.say(f'{path}: no plane: {result.reason}')
         if not result.verdict.ok and image.valid.any():

@@ -138,9 +138,10 @@ def no_depth(image: RangeImage) -> dict[str, str]:
 
 
 def filled_share(image: RangeImage) -> float:
-    """Share of the pixels that copy a neighbour up to a jump, more than do so from there on.
+    """Share of the pixels that copy a neighbour up to a jump.
 
-    Filters that fill holes continue a pixel to their far side; steps of the sensor do either.
+    Filters that fill holes continue a pixel to their far side; of steps of the sensor, a jump cuts
+    the last one short.
     """
     if image.camera is None:
         return 0.0
@@ -150,23 +151,24 @@ def filled_share(image: RangeImage) -> float:
         before, after = lines[:, :-1], lines[:, 1:]
         jumps = (before > 0) & (after > 0)
         jumps &= np.abs(before - after) > 0.05 * np.maximum(before, after)
-        width = lines.shape[1]
-        rows, columns = np.divmod(np.flatnonzero(jumps), width - 1)
-        ending = _runs(lines, rows * width + columns)
-        beginning = _runs(lines[:, ::-1], rows * width + width - 2 - columns)
-        short, long = sorted(
-            (runs[runs > 3] for runs in (ending, beginning)), key=lambda runs: len(runs)
-        )
-        certain = len(long) - len(short) > SIGNIFICANT * (len(long) + len(short)) ** 0.5
-        if certain and long.sum() > 2 * short.sum():
-            most = max(most, float(long.sum() - short.sum()) / measured)
+        rows, columns = np.nonzero(jumps)
+        for side, at in ((lines, columns), (lines[:, ::-1], lines.shape[1] - 2 - columns)):
+            copies = _excess(side, rows * lines.shape[1] + at)
+            if copies.sum() > SIGNIFICANT * (copies**2).sum() ** 0.5:
+                most = max(most, float(copies.sum()) / measured)
     return most
 
 
-def _runs(lines: NDArray[np.float32], at: NDArray[np.intp]) -> NDArray[np.intp]:
-    """How many pixels up to each of those `at` (N,), in raster order, have its value."""
+def _excess(lines: NDArray[np.float32], at: NDArray[np.intp]) -> NDArray[np.intp]:
+    """By how many pixels the runs of a value up to those `at` (N,) exceed the runs before them.
+
+    Of those that follow a measurement of their line; pixels are in raster order.
+    """
     begins = np.flatnonzero(np.diff(lines, axis=1, prepend=np.float32(-1)))
-    return at - begins[np.searchsorted(begins, at, 'right') - 1] + 1
+    last = np.searchsorted(begins, at, 'right') - 1
+    here, there = begins[last], begins[last - 1]
+    known = (here % lines.shape[1] > 0) & (lines.ravel()[here - 1] > 0)
+    return np.asarray((at + 1 - 2 * here + there)[known])
 
 
 def shows_range(
