@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rangeseg_ros import Config
+from rangeseg_ros.cli import evaluate, mount, replay
 from rangeseg_ros.core.options import ConfigError
 
 FIELDS = {f.name: f for f in fields(Config)}
@@ -18,6 +19,16 @@ def test_every_default_lies_in_its_range_and_every_parameter_is_described():
         assert len(f.metadata['description']) > 5
         free = f.type in ('bool', 'str')  # or the name of a frame or a file
         assert f.metadata['choices'] or f.metadata['low'] is not None or free
+
+
+@pytest.mark.parametrize('command', [evaluate.command, mount.command, replay.command])
+def test_options_of_commands_are_as_their_parameters(command):
+    named = [option for option in command.params if option.name in FIELDS]
+    assert named
+    for option in named:
+        f = FIELDS[option.name]
+        assert option.is_flag == (type(f.default) is bool)
+        assert tuple(getattr(option.type, 'choices', ())) == f.metadata['choices']
 
 
 def test_mapping_gives_what_the_constructor_gives():
