@@ -52,7 +52,7 @@ class DepthBag(Closing):
         self.path = path
         self.lost: Counter[str] = Counter()
         self.damage = ''
-        self.depth_topic, self.camera_topic = depth_topic or '', camera_topic or ''
+        self.depth_topic, self.camera_topic = depth_topic or '', ''
         self._raw, self._first_camera = raw, camera
         self._recording = Recording(path)
         try:
@@ -64,7 +64,6 @@ class DepthBag(Closing):
                 self.depth_topic = clouds[0]
             self.has_images = self.depth_topic not in clouds
             if not self.has_images:
-                self.camera_topic = ''
                 return
             self.depth_topic = depth_topic or self._find_depth_topic()
             self._require(self.depth_topic, 'depth image', IMAGES)
