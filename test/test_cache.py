@@ -3,6 +3,7 @@
 import functools
 import os
 import pickle
+import sys
 from dataclasses import replace
 from importlib import import_module
 from multiprocessing import get_context
@@ -18,7 +19,7 @@ from processes import python
 from rangeseg_ros import Config, RangeImage
 from rangeseg_ros import kernel_cache as cache
 from rangeseg_ros.compilation import preparation
-from rangeseg_ros.compilation.preparation import FIRST, KINDS, needs, prepare, rehearse
+from rangeseg_ros.compilation.preparation import FIRST, KINDS, _compile, needs, prepare, rehearse
 from rangeseg_ros.compilation.worker import discover
 from rangeseg_ros.core.runtime.kernels import nothing_compiled
 from rangeseg_ros.core.sensing.binning import STEPS
@@ -68,6 +69,15 @@ def run_restricted(code, allowed='', **environment):
     inherited = {k: v for k, v in os.environ.items() if k != 'NUMBA_CACHE_DIR'}
     home = {'HOME': '/proc/none', 'XDG_CACHE_HOME': '/proc/none'}
     return python(RESTRICT + code, allowed, cwd=ROOT, env={**inherited, **home, **environment})
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason='PYTHONSAFEPATH is of Python 3.11')
+def test_the_package_of_the_current_folder_is_not_compiled(tmp_path, monkeypatch):
+    (tmp_path / 'rangeseg_ros').mkdir()
+    (tmp_path / 'rangeseg_ros/__init__.py').write_text("open('imported', 'w')")
+    monkeypatch.chdir(tmp_path)
+    _compile(silent, Config(), ('image',), ())
+    assert not (tmp_path / 'imported').exists()
 
 
 def test_where_nothing_can_be_kept_kernels_last_as_long_as_the_process(tmp_path):

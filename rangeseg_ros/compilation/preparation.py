@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import astuple, replace
 from itertools import islice
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -92,12 +93,14 @@ def _compile(report: Report, *rehearsed: Any) -> None:
 
     What a process that breaks off leaves is compiled by its user.
     """
+    # Of this package, not of one in the current folder (Python 3.11), whose kernels are others.
+    path = os.pathsep.join(filter(None, [*sys.path, str(Path(__file__).parents[2])]))
     # Of a group of its own, so that Ctrl-C is for the parent.
     worker = subprocess.Popen(
         [sys.executable, '-m', 'rangeseg_ros.compilation.worker'],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
-        env={**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, sys.path))},
+        env={**os.environ, 'PYTHONPATH': path, 'PYTHONSAFEPATH': '1'},
         start_new_session=True,
     )
     assert worker.stdin and worker.stdout
