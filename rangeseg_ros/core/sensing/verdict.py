@@ -160,7 +160,7 @@ def filled_share(image: RangeImage) -> float:
 
 
 def _excess(lines: NDArray[np.float32], at: NDArray[np.intp]) -> NDArray[np.intp]:
-    """By how many pixels runs of a value up to pixels `at` (N,) exceed measured runs before them."""
+    """By how many pixels runs of a value up to those `at` (N,) exceed measured runs before."""
     begins = np.flatnonzero(np.diff(lines, axis=1, prepend=np.float32(-1)))
     last = np.searchsorted(begins, at, 'right') - 1
     here, there = begins[last], begins[last - 1]
