@@ -14,18 +14,25 @@ PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile
 
 .PHONY: test quick mutants ablate demo demo-ros lint docs wheel release-names release-check clean
 
+# With COVERAGE=1 it finds which tests run which line, too, and takes a quarter more time.
+test: export COVERAGE_PROCESS_START = $(if $(COVERAGE),$(CURDIR)/.ci/coverage.ini)
+test: export ROOT = $(CURDIR)
 test: $(VENV)/installed
-	$(PYTEST)
+	$(PYTEST) $(if $(COVERAGE),--cov --cov-config=.ci/coverage.ini --cov-context=test --cov-report= \
+	  --junitxml=.coverage.xml)
 
 # Without the tests that take long or need ROS 2.
 quick: $(VENV)/installed
 	$(PYTEST) -m 'not slow and not ros'
 
-# Single changes of the package, and whether tests notice: about a minute each.
+# Single changes of the package, and whether tests notice: about ten seconds each.
 COUNT ?= 300
 SEED ?= 0
-mutants: $(VENV)/installed
-	$(BIN)/python .ci/mutants.py --count $(COUNT) --seed $(SEED)
+mutants: .coverage
+	$(BIN)/python .ci/mutants.py --count $(COUNT) --seed $(SEED) --jobs 2
+
+.coverage: $(shell git ls-files rangeseg_ros test)
+	$(MAKE) test COVERAGE=1
 
 # What every mechanism costs and what it buys, on simulated frames and those in DATA: a few minutes.
 DATA ?=
@@ -107,4 +114,4 @@ $(VENV)/writers: $(VENV)/installed
 	touch $@
 
 clean:
-	rm -rf $(VENV) .venv-oldest demo site build install log dist *.egg-info
+	rm -rf $(VENV) .venv-oldest demo site build install log dist *.egg-info .coverage*

@@ -161,6 +161,7 @@ setup(
             'pandas>=2.0',
             'pypcd4>=1.2',
             'pytest>=7.4',
+            'pytest-cov>=7.0',
             'pytest-timeout>=2.2',
             'pytest-xdist>=3.3',
             'trimesh>=4.0',

@@ -1,10 +1,9 @@
 """Mutation testing: single changes of meaning, and whether any test notices them.
 
 Each mutant is a copy of the package with one operator, condition or number changed, drawn with a
-seed; the tests are those that import the changed module, directly or over the fewest steps. One
-that no test kills says what nothing tests (DeMillo, Lipton and Sayward: Hints on test data
-selection, Computer 1978). Mutants that change no result are listed in equivalent_mutants.txt
-beside this file.
+seed; the tests are those that run the changed line. One that no test kills says what nothing tests
+(DeMillo, Lipton and Sayward: Hints on test data selection, Computer 1978). Mutants that change no
+result are listed in equivalent_mutants.txt beside this file.
 """
 
 from __future__ import annotations
@@ -30,10 +29,9 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+from covering_tests import PACKAGE, REPORT, ROOT, CoveringTests
 from scipy.stats import binom
 
-ROOT = Path(__file__).parents[1]
-PACKAGE = ROOT / 'rangeseg_ros'
 EQUIVALENT = Path(__file__).with_name('equivalent_mutants.txt')
 # Probability below which a share of dead mutants is no chance.
 CHANCE = 0.01
@@ -62,10 +60,9 @@ _SWAPS = {
 
 
 class Mutant(NamedTuple):
-    """A change of the lines `first` to `last` of a file, in `function`, to `text`."""
+    """A change of the lines `first` to `last` of a file to `text`."""
 
     path: Path
-    function: str
     first: int
     last: int
     before: str
@@ -83,17 +80,14 @@ def mutants(path: Path) -> Iterator[Mutant]:
     source = path.read_text()
     lines = source.splitlines(keepends=True)
     tree = ast.parse(source)
-    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
     for node in _expressions(tree):
-        around = [f.name for f in functions if f.lineno <= node.lineno <= f.end_lineno]
         for changed in _changes(node):
             # Columns count bytes.
             first, last = lines[node.lineno - 1].encode(), lines[node.end_lineno - 1].encode()
             text = first[: node.col_offset].decode() + f'({ast.unparse(changed)})'
             text += last[node.end_col_offset :].decode()
-            before = ast.unparse(node)
-            function, after = (around or [path.stem])[-1], ast.unparse(changed)
-            yield Mutant(path, function, node.lineno, node.end_lineno, before, after, text)
+            before, after = ast.unparse(node), ast.unparse(changed)
+            yield Mutant(path, node.lineno, node.end_lineno, before, after, text)
 
 
 def _expressions(tree: ast.AST) -> Iterator[ast.expr]:
@@ -131,68 +125,6 @@ def _changes(node: ast.expr) -> Iterator[ast.expr]:
         yield ast.Constant(node.value + 1)
 
 
-def imports(path: Path) -> set[str]:
-    """Names of modules that a file imports."""
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.module:
-            found.add(node.module)
-            found |= {f'{node.module}.{item.name}' for item in node.names}
-        elif isinstance(node, ast.Import):
-            found |= {item.name for item in node.names}
-    return found
-
-
-class Selection:
-    """Which tests to run for a module."""
-
-    def __init__(self, most: int) -> None:
-        self._most = most
-        modules = {self._name(path): path for path in PACKAGE.rglob('*.py')}
-        self._users: dict[str, set[str]] = defaultdict(set)
-        for name, path in modules.items():
-            for other in imports(path) & modules.keys():
-                self._users[other].add(name)
-        helpers = {path.stem: path for path in (ROOT / 'test').glob('*.py')}
-        self._tests = {}
-        for path in sorted((ROOT / 'test').glob('test_*.py')):
-            found = imports(path)
-            for helper in found & helpers.keys():
-                found |= imports(helpers[helper])
-            # Commands are run by their names.
-            words = re.findall(r"'(\w+)'", path.read_text().replace('segment_image', "'segment'"))
-            found |= {f'{PACKAGE.name}.cli.{word}' for word in words}
-            self._tests[path] = found & modules.keys()
-
-    @staticmethod
-    def _name(path: Path) -> str:
-        parts = path.relative_to(ROOT).with_suffix('').parts
-        return '.'.join(parts[:-1] if parts[-1] == '__init__' else parts)
-
-    def tests(self, path: Path, function: str) -> list[Path]:
-        """Those at the fewest imports from the module, those that use it most first."""
-        tree = ast.parse(path.read_text())
-        names = [node.name for node in tree.body if hasattr(node, 'name')]
-        names += re.findall(r'^([A-Z]\w+)\b.* = ', path.read_text(), re.MULTILINE)
-        ring, seen = {self._name(path)}, set()
-        chosen: list[Path] = []
-        while ring and len(chosen) < self._most:
-            near = [test for test, used in self._tests.items() if used & ring]
-            uses = {test: sum(map(test.read_text().count, names)) for test in near}
-            near = sorted(set(near) - set(chosen), key=lambda test: (-uses[test], test))
-            # Those named alike, or that name the function, are about it.
-            near.sort(key=lambda test: path.stem.rstrip('s') not in test.stem)
-            near.sort(key=lambda test: function not in test.read_text())
-            chosen += near[: self._most - len(chosen)]
-            seen |= ring
-            ring = {user for module in ring for user in self._users[module]} - seen
-        # What nothing imports is a command, or what one needs, or the node: a process of it.
-        alike = [test for test in self._tests if path.stem.rstrip('s') in test.stem]
-        return (chosen or alike or sorted((ROOT / 'test').glob('test_node_[fs]*.py')))[
-            : self._most
-        ]
-
-
 def run(
     tests: list[str], limit: float, root: str, mutant: Mutant | None = None
 ) -> tuple[str, str]:
@@ -206,9 +138,6 @@ def run(
         lines[mutant.first - 1 : mutant.last] = [mutant.text]
         target.write_text(''.join(lines))
     command = [sys.executable, '-m', 'pytest', '-x', '-q', '-n', '0', '--no-header', *tests]
-    if mutant:
-        of_ros = 'rclpy' in mutant.path.read_text()
-        command += ['-m', 'not slow' if of_ros else 'not slow and not ros']
     environment = {**os.environ, 'PYTHONPATH': folder, 'PYTHONDONTWRITEBYTECODE': '1'}
     environment.pop('NUMBA_CACHE_DIR', None)
     with tempfile.TemporaryFile('w+') as output:
@@ -251,7 +180,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--count', type=int, default=300, help='mutants to draw')
     parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--files', type=int, default=8, help='files of tests for each, at most')
+    parser.add_argument('--seconds', type=float, default=60, help='of tests for each, about')
     parser.add_argument('--name', default='', help='of names (path: before -> after): a pattern')
     parser.add_argument('--least', type=float, default=0.85, help='share that is to die')
     parser.add_argument('--limit', type=float, default=600, help='seconds for one')
@@ -268,7 +197,9 @@ def main() -> int:
         if mutant.name not in known and re.search(chosen.name, mutant.name)
     ]
     drawn = random.Random(chosen.seed).sample(every, min(chosen.count, len(every)))
-    selection = Selection(chosen.files)
+    if not REPORT.exists():
+        parser.error('which tests run which line is not known: make test COVERAGE=1')
+    covering = CoveringTests()
     end = time.monotonic() + 60 * chosen.minutes
     place = tempfile.TemporaryDirectory(prefix='mutants-', ignore_cleanup_errors=True)
 
@@ -289,11 +220,9 @@ def main() -> int:
     def judged(mutant: Mutant) -> str:
         if time.monotonic() > end:
             return 'no time'
-        tests = selection.tests(mutant.path, mutant.function)
-        names = [str(test.relative_to(ROOT)) for test in tests]
         outcome, failed = 'untested', ''
-        if names:
-            outcome, failed = run(names, chosen.limit, place.name, mutant)
+        if tests := covering.of(mutant.path, mutant.first, mutant.last, chosen.seconds):
+            outcome, failed = run(tests, chosen.limit, place.name, mutant)
         if outcome == 'killed' and failed and not passes(failed):
             outcome = 'unsound'
         if end == -math.inf:
