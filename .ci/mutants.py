@@ -35,6 +35,7 @@ from scipy.stats import binom
 EQUIVALENT = Path(__file__).with_name('equivalent_mutants.txt')
 # Probability below which a share of dead mutants is no chance.
 CHANCE = 0.01
+_DRAWS = {'choice', 'integers', 'normal', 'one_of', 'uniform'}
 _SWAPS = {
     ast.Lt: ast.LtE,
     ast.LtE: ast.Lt,
@@ -87,6 +88,9 @@ def mutants(path: Path) -> Iterator[Mutant]:
             text = first[: node.col_offset].decode() + f'({ast.unparse(changed)})'
             text += last[node.end_col_offset :].decode()
             before, after = ast.unparse(node), ast.unparse(changed)
+            if isinstance(node, ast.Constant):
+                # A number alone does not tell which it is.
+                before, after = lines[node.lineno - 1].strip(), text.strip()
             yield Mutant(path, node.lineno, node.end_lineno, before, after, text)
 
 
@@ -97,6 +101,9 @@ def _expressions(tree: ast.AST) -> Iterator[ast.expr]:
             continue
         for child in value if isinstance(value, list) else [value]:
             if not isinstance(child, ast.AST) or isinstance(child, ast.JoinedStr):
+                continue
+            # A size that is drawn is as good as another.
+            if isinstance(child, ast.Call) and getattr(child.func, 'attr', '') in _DRAWS:
                 continue
             # zip() asserts that its arguments are of one length.
             if isinstance(child, ast.keyword) and child.arg == 'strict':
