@@ -72,14 +72,3 @@ def test_invariants(method, data):
         assert (plane.covariance == plane.covariance.T).all()
         values = np.linalg.eigvalsh(plane.covariance)
         assert values[0] > -1e-9 * max(values[-1], 1e-30)
-
-
-@pytest.mark.parametrize(('method', 'size'), [('normals', 1), ('planes', 1), ('planes', 4)])
-def test_a_steep_ramp_without_an_end_is_no_plane(method, size):
-    depth = np.tile((0.3 + np.arange(160 * size)).astype(np.float32), (120 * size, 1))
-    camera = Camera(160 * size, 120 * size, 300, 300, 80 * size - 0.5, 60 * size - 0.5)
-    with pytest.warns(UnitWarning):
-        image = RangeImage.from_depth(depth, camera)
-    result = Segmenter(Config(method=method)).segment(image)
-    assert all(np.isfinite(plane.extents).all() for plane in result.planes)
-    assert set(np.unique(result.labels)) - {0} == {plane.label for plane in result.planes}
