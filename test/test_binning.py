@@ -1,7 +1,5 @@
 """Means of squares of pixels, borders of the planes found in them, and shares of the work."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from clouds import cloud_of
@@ -183,36 +181,25 @@ def test_borders_are_those_of_pixels():
     )
 
 
-BUDGETS = (*STEPS, 0.0)
-
-
 @pytest.fixture(scope='module')
 def room():
+    """What a Kinect sees of a room, and the labels of its faces."""
     camera = kinect_camera(321, 241)
-    return simulate(kinect_room(2), Kinect(0), camera, seed=2), camera
+    frame = simulate(kinect_room(2), Kinect(0), camera, seed=2)
+    return RangeImage.from_depth(frame.depth, camera), frame.labels
 
 
-@pytest.fixture(scope='module')
-def image(room):
-    return RangeImage.from_depth(room[0].depth, room[1])
+def test_work_falls_with_the_budget():
+    assert STEPS == (1, 0.55, 0.35)
+    budgets = (1, 0.56, 0.55, 0.54, 0.36, 0.35, 0.34, 0)
+    assert [step_within(budget) for budget in budgets] == [1, 2, 2, 4, 4, 4, 4, 4]
 
 
-@pytest.fixture(scope='module')
-def results(image):
-    return {budget: Segmenter(Config(work_budget=budget)).segment(image) for budget in BUDGETS}
-
-
-def test_less_is_never_more():
-    steps = [step_within(budget) for budget in np.linspace(1, 0, 1001)]
-    assert [step_within(budget) for budget in STEPS] == [1, 2, 4]
-    assert steps[0] == 1 and steps[-1] == 4
-    assert all(before <= after for before, after in pairwise(steps))
-
-
-@pytest.mark.parametrize('budget', BUDGETS)
-def test_planes_are_those_of_the_scene(image, room, results, budget):
+@pytest.mark.parametrize('budget', [*STEPS, 0.0])
+def test_planes_are_those_of_the_scene(room, budget):
     """Every wall, floor and ceiling of a twelfth of the image is found, its pixels too."""
-    result, truth = results[budget], room[0].labels
+    image, truth = room
+    result = Segmenter(Config(work_budget=budget)).segment(image)
     assert result.labels.shape == result.edges.shape == image.shape
     assert not result.labels[~image.valid].any()
     counts = [np.count_nonzero(result.labels == plane.label) for plane in result.planes]
@@ -221,17 +208,15 @@ def test_planes_are_those_of_the_scene(image, room, results, budget):
         region = (truth == label) & image.valid
         if np.count_nonzero(region) < image.valid.size / 12:
             continue
-        found = np.bincount(result.labels[region])
-        best = result.labels == found[1:].argmax() + 1
+        best = result.labels == np.bincount(result.labels[region])[1:].argmax() + 1
         # Of every fourth pixel borders are four pixels wide.
         least = 0.85 if budget > 0 else 0.7
         assert (best & region).sum() > least * (best | region).sum()
 
 
-def test_clouds_and_bodies_are_halved(image):
-    cloud = cloud_of(image.points)
-    budget = Config(work_budget=0.7)
-    result = Segmenter(budget).segment(cloud)
+def test_clouds_and_bodies_are_halved(room):
+    image, budget = room[0], Config(work_budget=0.7)
+    result = Segmenter(budget).segment(cloud_of(image.points))
     assert result.labels.shape == image.shape and result.planes
     body = np.zeros(image.shape, bool)
     body[150:] = True
@@ -245,7 +230,6 @@ def test_budgets_are_for_method_planes():
 
 
 def test_planes_scatter_by_the_noise_of_pixels_and_not_of_bins():
-    depth = 2 + np.random.default_rng(0).normal(0, 0.004, (480, 640))
-    camera = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
-    (plane,) = Segmenter().segment(RangeImage.from_depth(depth, camera)).planes
+    depth = 2 + np.random.default_rng(0).normal(0, 0.004, CAMERA.shape)
+    (plane,) = Segmenter().segment(RangeImage.from_depth(depth, CAMERA)).planes
     assert plane.rms == pytest.approx(0.004, rel=0.03)

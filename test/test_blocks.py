@@ -206,10 +206,3 @@ def test_measurements_are_linked_but_across_jumps():
     jumps = np.array([[True, False], [False, False]]), np.array([[False, False, True]])
     horizontal, vertical = grid_of(image_of(np.ones((2, 3))), jumps)
     assert (horizontal.tolist(), vertical.tolist()) == ([[0, 1], [1, 1]], [[1, 1, 0]])
-
-
-@pytest.mark.parametrize('shape', [(1, 1), (1, 4), (3, 2)])
-def test_shadow_is_disconnected_and_small_images_pass(shape):
-    horizontal, vertical = grid_of(image_of(np.zeros(shape)))
-    assert horizontal.shape == (shape[0], shape[1] - 1) and not horizontal.any()
-    assert vertical.shape == (shape[0] - 1, shape[1]) and not vertical.any()

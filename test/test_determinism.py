@@ -47,14 +47,17 @@ def digest(result):
     return hashlib.sha256(b''.join(part.tobytes() for part in told)).hexdigest()
 
 
-@pytest.mark.parametrize('threads', [1, 5])
-def test_any_number_of_threads_gives_the_same_bits(digests, threads):
+@pytest.fixture(params=[1, 2, 7])
+def threads(request):
     before = cv2.getNumThreads()
-    cv2.setNumThreads(threads)
-    try:
-        assert all_digests() == digests
-    finally:
-        cv2.setNumThreads(before)
+    cv2.setNumThreads(request.param)
+    yield request.param
+    cv2.setNumThreads(before)
+
+
+@pytest.mark.parametrize('threads', [1, 5], indirect=True)
+def test_any_number_of_threads_gives_the_same_bits(digests, threads):
+    assert all_digests() == digests
 
 
 def in_another_process(function, **environment):
@@ -136,14 +139,6 @@ def test_plain_python_gives_what_compiled_code_gives():
     plain, compiled = in_another_process(frames, NUMBA_DISABLE_JIT='1'), frames()
     assert [one for one, other in zip(plain, compiled, strict=True) if one != other] == []
     assert [len(planes) >= 5 for _, _, planes in compiled[:2]] == [True, True]
-
-
-@pytest.fixture(params=[1, 2, 7])
-def threads(request):
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(request.param)
-    yield request.param
-    cv2.setNumThreads(before)
 
 
 def test_halves_do_not_depend_on_the_number_of_threads(threads):

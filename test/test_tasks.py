@@ -100,8 +100,12 @@ def test_a_worker_that_loses_a_signal_ends_where_another_dies(tmp_path):
 
 
 def test_results_come_in_order_whatever_workers_die(tmp_path):
-    tasks = [Square(number, tmp_path if number in (1, 4) else None) for number in range(6)]
-    assert list(run_all(tasks, 2)) == [0, 1, 4, 9, 16, 25]
+    """A task that kills every worker is given up."""
+    tasks = [Square(0), Square(1, tmp_path), Deadly(), Square(3, tmp_path), Square(4), Square(5)]
+    results = list(attempt_all(tasks, 2))
+    given_up = results.pop(2)
+    assert results == [0, 1, 9, 16, 25]
+    assert isinstance(given_up, Failure) and '2 workers' in str(given_up.error)
 
 
 @pytest.mark.parametrize('jobs', [1, 2])
@@ -112,12 +116,6 @@ def test_a_failure_costs_its_task_and_no_other(jobs):
     assert [type(result.error) for result in results[1:3]] == [ValueError, MemoryError]
     with pytest.raises(ValueError, match='bad'):
         list(run_all(tasks, jobs))
-
-
-def test_a_task_that_kills_every_worker_is_given_up():
-    results = list(attempt_all([Square(2), Deadly(), Square(3)], 2))
-    assert (results[0], results[2]) == (4, 9)
-    assert isinstance(results[1], Failure) and '2 workers' in str(results[1].error)
 
 
 PARENT = """
