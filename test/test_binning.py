@@ -116,6 +116,12 @@ def test_the_model_of_bins_is_that_of_their_means(correlation, white):
     assert narrow.noise == pytest.approx(pixels.noise / 2)
 
 
+def neighbours(i, j, shape):
+    """Places beside one that are inside an image, in raster order."""
+    around = (i - 1, j), (i, j - 1), (i, j + 1), (i + 1, j)
+    return [(a, b) for a, b in around if 0 <= a < shape[0] and 0 <= b < shape[1]]
+
+
 @pytest.mark.parametrize('side', [2, 3])
 def test_pixels_beside_borders_take_the_label_of_the_lowest_cost(side):
     """One by one, given their neighbours."""
@@ -137,15 +143,13 @@ def test_pixels_beside_borders_take_the_label_of_the_lowest_cost(side):
     sensor, prior = SensorModel(0.01, 0, 1, 0, 0, 0, 35), 0.9
     expected = regions.repeat(side, 0).repeat(side, 1)[:17, :21] * image.valid
     for i, j in np.ndindex(bins):
-        around = [(i, j), (i - 1, j), (i, j - 1), (i, j + 1), (i + 1, j)]
-        inside = [at for at in around if 0 <= at[0] < bins[0] and 0 <= at[1] < bins[1]]
+        inside = (i, j), *neighbours(i, j, bins)
         names = list(dict.fromkeys(int(regions[at]) for at in inside))[:4]
         for u, v in np.ndindex(side, side) if len(names) > 1 else ():
             u, v = i * side + u, j * side + v
             if u >= 17 or v >= 21 or inverse[u, v] == 0:
                 continue
-            near = [(u - 1, v), (u, v - 1), (u + 1, v), (u, v + 1)]
-            near = [at for at in near if 0 <= at[0] < 17 and 0 <= at[1] < 21 and image.valid[at]]
+            near = [at for at in neighbours(u, v, camera.shape) if image.valid[at]]
             moved = 1 + np.where(np.equal(names, 0), 0, values[names, i // NODE, j // NODE])
             off = image.inverse[u, v] - moved * (theta[names] @ camera.rays[u, v])
             costs = np.minimum(models.half_precision[names] * off**2 / 1e-4, CAP)

@@ -8,7 +8,7 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import Grid, View, grid_of
-from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, SIZE, fit, fit_all
+from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, SIZE, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -28,11 +28,6 @@ def nodes_of(inverse, rays, edges, **sensor):
     """Blocks of 2 x 2 pixels that surfaces are grown from."""
     image, model = RangeImage(rays, inverse), SensorModel.from_config(Config(**sensor))
     return Nodes.of(View(image, image, Blocks.of(image), edges, model, 1, 0.0, True))
-
-
-def whole(inverse, edges):
-    """Whether surfaces are grown from the blocks."""
-    return nodes_of(inverse, grid(*inverse.shape)[1], edges).moments[..., COUNT] > 0
 
 
 @pytest.mark.parametrize('hole', [(2, 2), (3, 2), (2, 3), np.s_[4], np.s_[:4, 4]])
@@ -67,9 +62,9 @@ def test_blocks_are_sums_over_their_pixels(shape, size):
         np.testing.assert_allclose(whole.moments[i, j], parts.sum(axis=0), rtol=1e-12)
 
 
-def test_blocks_that_jumps_cross_are_left_out():
+def test_blocks_that_jumps_cross_or_that_lack_two_measurements_are_left_out():
     """Only those: an edge on the border of two blocks, or beside a hole, crosses neither."""
-    inverse, _, edges = grid(6, 10)
+    inverse, rays, edges = grid(6, 10)
     horizontal, vertical = edges
     horizontal[1, 0] = 0  # inside block (0, 0)
     vertical[4, 5] = 0  # inside block (2, 2)
@@ -77,17 +72,11 @@ def test_blocks_that_jumps_cross_are_left_out():
     vertical[1, 6] = 0  # between blocks (0, 3) and (1, 3)
     inverse[0, 9] = 0
     horizontal[0, 8] = vertical[0, 9] = 0
+    inverse[2:4, 0] = inverse[4:, 8:] = 0
     expected = np.ones((3, 5), bool)
-    expected[0, 0] = expected[2, 2] = False
-    np.testing.assert_array_equal(whole(inverse, Grid(horizontal, vertical)), expected)
-
-
-@pytest.mark.parametrize(('missing', 'kept'), [(1, True), (2, False), (4, False)])
-def test_blocks_of_too_few_measurements_are_left_out(missing, kept):
-    """Three points determine a plane."""
-    inverse, _, edges = grid(2, 2)
-    inverse.ravel()[:missing] = 0
-    assert whole(inverse, edges)[0, 0] == kept
+    expected[[0, 2, 1, 2], [0, 2, 0, 4]] = False
+    kept = nodes_of(inverse, rays, edges).moments[..., COUNT] > 0
+    np.testing.assert_array_equal(kept, expected)
 
 
 @pytest.mark.parametrize('shape', [(12, 16), (11, 13), (9, 18), (1, 1), (1, 9), (9, 1), (3, 5)])
@@ -161,17 +150,12 @@ def moments_of(rays, inverse, weight):
     return np.pad(sums, (0, SIZE - len(sums)))
 
 
-def fitted(moments):
-    theta = np.full(3, np.nan)
-    return theta, fit(moments, theta)
-
-
 @pytest.mark.parametrize('seed', range(5))
 def test_fit_is_weighted_least_squares(seed):
     rays, inverse, weight = pixels(seed)
     root = np.sqrt(weight)
     expected, residual, _, _ = np.linalg.lstsq(root[:, None] * rays, root * inverse, rcond=None)
-    theta, chi2 = fitted(moments_of(rays, inverse, weight))
+    (theta,), (chi2,) = fit_all(moments_of(rays, inverse, weight)[None])
     np.testing.assert_allclose(theta, expected, rtol=1e-6)
     assert chi2 == pytest.approx(residual[0], rel=1e-6)
 
@@ -186,12 +170,9 @@ def test_pixels_that_determine_no_plane(case):
     else:
         rays[:] = rays[np.arange(40) % 2]
     moments = moments_of(rays, inverse, weight)
-    theta, chi2 = fitted(moments)
-    assert not theta.any()
-    assert chi2 == moments[CHI2]
-    many, residuals = fit_all(np.stack([moments, moments_of(*pixels(9))]))
-    assert not many[0].any() and many[1].any()
-    assert residuals[0] == chi2
+    theta, chi2 = fit_all(np.stack([moments, moments_of(*pixels(9))]))
+    assert not theta[0].any() and theta[1].any()
+    assert chi2[0] == moments[CHI2]
 
 
 def image_of(depth):

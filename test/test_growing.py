@@ -62,16 +62,11 @@ def test_a_plane_is_one_surface(noise):
 @pytest.mark.parametrize('turn', [0.4, -0.4, 0.15])
 def test_planes_that_meet_at_a_crease_are_two_surfaces(turn):
     """The inverse range is continuous: nothing but the slopes tells them apart."""
-    column = 80
-    at = (column - 0.5 - CAMERA.cx) / CAMERA.fx
-    right = WALL + np.array([turn, 0, -turn * at])
-    left_side = np.arange(CAMERA.width) < column
-    labels, moments = grown(np.where(left_side, plane(WALL), plane(right)))
+    right = WALL + np.array([turn, 0, 0])  # they meet on the axis, at column 79.5
+    labels, moments = grown(np.where(COLUMNS < 80, plane(WALL), plane(right)))
     assert len(moments) == 3
-    middle = column // 2
-    left, other = labels[:, :middle].max(), labels[:, middle + 4 :].max()
-    assert covered(labels[:, : middle - 4], left) > 0.9
-    assert covered(labels[:, middle + 4 :], other) > 0.9
+    left, other = labels[:, :40].max(), labels[:, 44:].max()
+    assert covered(labels[:, :36], left) > 0.9 and covered(labels[:, 44:], other) > 0.9
     planes = fit_all(moments)[0]
     np.testing.assert_allclose(planes[left], WALL, atol=3e-3)
     np.testing.assert_allclose(planes[other], right, atol=5e-3)

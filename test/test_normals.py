@@ -20,19 +20,16 @@ def plane_image(normal, distance, camera=CAMERA):
 
 
 NORMALS = [(0, 0, -1), (0.3, -0.4, -np.sqrt(0.75)), (-0.6, 0.0, -0.8), (0, -0.8, -0.6)]
-METHODS = [
-    lambda image: cross_product(image, 1),
-    lambda image: cross_product(image, 3),
-    lambda image: plane_fit(image, 1),
-    lambda image: plane_fit(image, 3),
-]
+METHODS = pytest.mark.parametrize('method', [cross_product, plane_fit])
+REACHES = pytest.mark.parametrize('reach', [1, 3])
 
 
-@pytest.mark.parametrize('method', METHODS)
+@METHODS
+@REACHES
 @pytest.mark.parametrize('normal', NORMALS)
-def test_normal_of_an_exact_plane(normal, method):
+def test_normal_of_an_exact_plane(normal, method, reach):
     image = plane_image(normal, 1.7)
-    found = method(image)
+    found = method(image, reach)
     defined = np.isfinite(found[..., 0])
     assert defined.any() and (defined[8:-8, 8:-8].all() or not image.valid.all())
     angle = np.degrees(np.arccos(np.clip(found[defined] @ normal, -1, 1)))
@@ -40,22 +37,24 @@ def test_normal_of_an_exact_plane(normal, method):
     np.testing.assert_allclose(np.linalg.norm(found[defined], axis=1), 1, atol=1e-5)
 
 
-@pytest.mark.parametrize('method', METHODS)
-def test_clouds_of_another_frame_point_to_the_sensor_too(method):
+@METHODS
+@REACHES
+def test_clouds_of_another_frame_point_to_the_sensor_too(method, reach):
     """The wall x = 2 in front of a scanner that looks along x."""
     azimuth = np.radians(np.linspace(-20, 20, 40))[None, :]
     elevation = np.radians(np.linspace(15, -15, 30))[:, None]
     y, z = 2 * np.tan(azimuth), 2 * np.tan(elevation) / np.cos(azimuth)
     points = np.stack(np.broadcast_arrays(2.0, y, z), axis=-1)
-    found = method(RangeImage.from_points(points))
+    found = method(RangeImage.from_points(points), reach)
     np.testing.assert_allclose(found[15, 20], [-1, 0, 0], atol=2e-3)
 
 
-@pytest.mark.parametrize(('method', 'reach'), zip(METHODS, [1, 3, 1, 3], strict=True))
+@METHODS
+@REACHES
 def test_undefined_at_the_border_and_beside_shadow_and_nowhere_else(method, reach):
     depth = plane_image((0, 0, -1), 1.0).points[..., 2].copy()
     depth[15, 20] = np.nan
-    found = np.isfinite(method(RangeImage.from_depth(depth, CAMERA))[..., 0])
+    found = np.isfinite(method(RangeImage.from_depth(depth, CAMERA), reach)[..., 0])
     rows, columns = np.indices(found.shape)
     inside = (rows >= reach) & (rows < 30 - reach) & (columns >= reach) & (columns < 40 - reach)
     assert not found[~inside].any() and not found[[15, 15, 15 - reach], [20, 20 + reach, 20]].any()

@@ -245,32 +245,20 @@ def test_a_plane_by_another_name_is_the_same_plane():
 
 # A region of 16 pixels tells its normal to ten degrees, where normal and distance are no longer
 # linear in the errors: a twentieth of a Kinect's.
-SMALL = 0.05
+UNIT = 0.05 * QUANTUM
+# With errors of one kind, and of all.
+SENSORS = {
+    'white': SensorModel(0.45 * UNIT, 0, 1.0, 2, 0, 0, 35),
+    'correlated': SensorModel(0.45 * UNIT, 0, 0.0, 2, 0, 0, 35),
+    'systematic': SensorModel(0.01 * UNIT, 0, 1.0, 2, 0.5 * UNIT, 0, 35),
+    'all': SensorModel(0.45 * UNIT, 0, 0.33, 2, 0.5 * UNIT, 0, 35),
+    'laser': SensorModel(0, 2 * UNIT, 0.2, 2, 0, 2 * UNIT, 20),
+}
 
 
-def part(x, y, width, height):
-    """Camera that sees a part of a Kinect's image."""
-    return Camera(width, height, 585.0, 585.0, 319.5 - x, 239.5 - y)
-
-
-def inverse_range(camera):
-    return -(camera.rays.astype(float) @ (NORMAL / DISTANCE))
-
-
-def models(unit):
-    """Sensors with errors of one kind, and of all."""
-    return {
-        'white': SensorModel(0.45 * unit, 0, 1.0, 2, 0, 0, 35),
-        'correlated': SensorModel(0.45 * unit, 0, 0.0, 2, 0, 0, 35),
-        'systematic': SensorModel(0.01 * unit, 0, 1.0, 2, 0.5 * unit, 0, 35),
-        'all': SensorModel(0.45 * unit, 0, 0.33, 2, 0.5 * unit, 0, 35),
-        'laser': SensorModel(0, 2 * unit, 0.2, 2, 0, 2 * unit, 20),
-    }
-
-
-@pytest.mark.parametrize('kind', models(1))
+@pytest.mark.parametrize('kind', SENSORS)
 @pytest.mark.parametrize(
-    ('view', 'radius'),  # of an ellipse, of which 1 touches the borders and 2 fills the image
+    ('view', 'radius'),
     [
         ((400, 100, 16, 16), 2),
         ((100, 300, 50, 8), 2),
@@ -279,8 +267,10 @@ def models(unit):
     ],
 )
 def test_sums_over_cells_are_those_over_pixels(kind, view, radius):
-    camera, sensor = part(*view), models(SMALL * QUANTUM)[kind]
-    exact = inverse_range(camera)
+    """Of an ellipse in a part of a Kinect's image: 1 touches its borders, and 2 fills it."""
+    x, y, *size = view
+    camera, sensor = Camera(*size, 585.0, 585.0, 319.5 - x, 239.5 - y), SENSORS[kind]
+    exact = -(camera.rays.astype(float) @ (NORMAL / DISTANCE))
     height, width = (n * 1j for n in camera.shape)
     mask = np.hypot(*np.ogrid[-1:1:height, -1:1:width]) < radius
     image = RangeImage(camera.rays, exact.astype(np.float32), camera)
