@@ -3,17 +3,17 @@
 import csv
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
 from recordings import EARLY_TF, SUFFIXES, TF, Recording
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.batch.replay import Replay
-from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.mapping.transforms import Transform, TransformError
+from rangeseg_ros import Camera
+from rangeseg_ros.core.mapping.transforms import TransformError
+from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.files import FileError
-from rangeseg_ros.io.poses import match_poses, read_pose
+from rangeseg_ros.io.images import write_image
+from rangeseg_ros.io.poses import match_poses
 from rangeseg_ros.io.tables import parts_value
 from rangeseg_ros.io.transforms import RecordedTransforms
 from rangeseg_ros.simulation.scenes import OPTICAL_IN_BODY
@@ -34,13 +34,34 @@ def depth(k):
     return np.round(1000 * np.minimum(ground, (WALL - STEP * k) / ahead)).astype(np.uint16)
 
 
-def stamp_of(k):
-    return 10**18 + k * 100_000_000
-
-
-def check(folder):
-    """Both planes, where they are in the fixed frame."""
-    with (folder / 'map.csv').open() as file:
+@pytest.mark.parametrize(
+    ('storage', 'kind'), [('mcap', TF), ('sqlite3', TF), ('rosbag1', TF), ('rosbag1', EARLY_TF)]
+)
+def test_tf_of_any_recording_places_the_planes(tmp_path, run, storage, kind):
+    recording = Recording(ros1=storage == 'rosbag1')
+    recording.add_transform(
+        10**18, 'base_link', 'optical', OPTICAL.as_quat(), (0, 0, ABOVE), kind, static=True
+    )
+    for k in range(FRAMES):
+        stamp = 10**18 + k * 10**8
+        recording.add_camera(stamp)
+        recording.add_image(stamp, depth(k))
+        # Between samples, so that they are interpolated.
+        for after in (-20_000_000, 20_000_000):
+            x = STEP * (k + after * 1e-8)
+            recording.add_transform(
+                stamp + after, 'odom', 'base_link', (0, 0, 0, 1), (x, 0, 0), kind
+            )
+    recording.messages.sort(key=lambda message: message[0])
+    path, out, params = (tmp_path / name for name in (f'a{SUFFIXES[storage]}', 'out', 'p.yaml'))
+    recording.write(path, storage)
+    params.write_text('min_pixels: 300\ngravity_frame: odom\n')
+    options = '--fixed-frame', 'odom', '--params', params, '--output', out
+    code, told, error = run('replay', path, *options)
+    assert (code, error) == (0, '')
+    # No note of frames whose place is not known.
+    assert told.splitlines()[1:] == [f'{out}: {FRAMES} frames, 2 planes in the map']
+    with (out / 'map.csv').open() as file:
         rows = list(csv.DictReader(file))
     found = {
         tuple(round(float(row[f'normal_{axis}']), 1) + 0.0 for axis in 'xyz'): row for row in rows
@@ -55,88 +76,29 @@ def check(folder):
         parts = [part.split('|') for part in row['parts'].split('||')]
         assert parts[0] == [row['hull'], *filter(None, row['holes'].split('|'))]
         assert int(row['last_stamp']) - int(row['first_stamp']) == (FRAMES - 1) * 10**8
-    assert (folder / 'map.ply').read_bytes().startswith(b'ply')
+    assert (out / 'map.ply').read_bytes().startswith(b'ply')
 
 
-@pytest.mark.parametrize(
-    ('storage', 'kind'), [('mcap', TF), ('sqlite3', TF), ('rosbag1', TF), ('rosbag1', EARLY_TF)]
-)
-def test_tf_of_any_recording_places_the_planes(tmp_path, storage, kind):
-    recording = Recording(ros1=storage == 'rosbag1')
-    recording.add_transform(
-        10**18, 'base_link', 'optical', OPTICAL.as_quat(), (0, 0, ABOVE), kind, static=True
-    )
-    for k in range(FRAMES):
-        stamp = stamp_of(k)
-        recording.add_camera(stamp)
-        recording.add_image(stamp, depth(k))
-        # Between samples, so that they are interpolated.
-        for after in (-20_000_000, 20_000_000):
-            x = STEP * (k + after * 1e-8)
-            recording.add_transform(
-                stamp + after, 'odom', 'base_link', (0, 0, 0, 1), (x, 0, 0), kind
-            )
-    recording.messages.sort(key=lambda message: message[0])
-    path = tmp_path / f'recording{SUFFIXES[storage]}'
-    recording.write(path, storage)
-    config = Config(fixed_frame='odom', gravity_frame='odom', min_pixels=300)
-    outcome = Replay(path, tmp_path / 'out', config).run()
-    assert outcome.mapped == 2 and not outcome.notes
-    check(tmp_path / 'out')
-
-
-def test_poses_in_files_become_a_map(tmp_path, run):
-    images, poses = tmp_path / 'images', tmp_path / 'poses'
-    for folder in (images, poses):
-        folder.mkdir()
-    for k in range(FRAMES):
-        cv2.imwrite(str(images / f'frame-{k:04d}.depth.png'), depth(k))
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = OPTICAL.as_matrix(), (STEP * k, 0, ABOVE)
-        np.savetxt(poses / f'frame-{k:04d}.pose.txt', pose)
-    (tmp_path / 'camera.yaml').write_text(
-        f'image_width: {WIDTH}\nimage_height: {HEIGHT}\ncamera_matrix: {{rows: 3, cols: 3, data: '
-        f'[{FOCAL}, 0, 31.5, 0, {FOCAL}, 23.5, 0, 0, 1]}}\n'
-    )
-    (tmp_path / 'p.yaml').write_text('min_pixels: 300\ngravity_frame: world\n')
-
-    bag, out = tmp_path / 'bag', tmp_path / 'out'
-    camera = tmp_path / 'camera.yaml'
-    files = '--camera', camera, '--poses', poses, '--output', bag
-    assert run('pack', images, *files, '--rate', 10)[0] == 0
-    options = '--fixed-frame', 'world', '--params', tmp_path / 'p.yaml'
-    code, told, error = run('replay', bag, *options, '--output', out)
-    assert code == 0 and f'{FRAMES} frames, 2 planes in the map' in told, error
-    check(out)
-
-
-CAMERA = """
-image_width: 64
-image_height: 48
-camera_matrix: {rows: 3, cols: 3, data: [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]}
-"""
 FRAME = 'camera_depth_optical_frame'
 
 
 @pytest.fixture
-def folders(tmp_path):
-    (tmp_path / 'camera.yaml').write_text(CAMERA)
-    images, poses = tmp_path / 'images', tmp_path / 'poses'
-    images.mkdir()
-    poses.mkdir()
-    for k in range(6):
-        cv2.imwrite(str(images / f'frame-{k:06d}.depth.png'), np.full((48, 64), 900, np.uint16))
-    return images, poses
+def poses(tmp_path):
+    """Folder of poses, empty."""
+    (tmp_path / 'poses').mkdir()
+    return tmp_path / 'poses'
 
 
 @pytest.fixture
-def pack(folders, run):
-    """Pack the images with their poses: the bag, and what is said."""
+def pack(tmp_path, run, poses):
+    """Pack images with their poses: the bag, and what is said."""
+    camera, images, bag = (tmp_path / name for name in ('camera.yaml', 'images', 'bag'))
+    write_camera(camera, Camera(WIDTH, HEIGHT, FOCAL, FOCAL, 31.5, 23.5))
+    for k in range(FRAMES):
+        write_image(images / f'frame-{k:06d}.depth.png', depth(k))
 
     def run_command(*options):
-        images, poses = folders
-        bag = images.parent / 'bag'
-        files = '--camera', images.parent / 'camera.yaml', '--poses', poses, '--output', bag
+        files = '--camera', camera, '--poses', poses, '--output', bag
         code, output, error = run('pack', images, *files, *options)
         assert code == 0, error
         return bag, output
@@ -151,9 +113,9 @@ def some_pose(k):
     return pose
 
 
-def test_poses_become_transforms_at_the_stamps_of_their_images(folders, pack):
+def test_poses_become_transforms_at_the_stamps_of_their_images(poses, pack):
     for k in range(5):
-        np.savetxt(folders[1] / f'frame-{k}.pose.txt', some_pose(k))
+        np.savetxt(poses / f'frame-{k}.pose.txt', some_pose(k), delimiter=', ' if k % 2 else ' ')
     bag, output = pack('--rate', '10')
     told = '5 poses, 1 without: no pose for frame-000005.depth.png'
     assert output.splitlines()[-2:] == [f'{bag}: 6 images', told]
@@ -168,14 +130,14 @@ def test_poses_become_transforms_at_the_stamps_of_their_images(folders, pack):
                 transforms.lookup('world', FRAME, stamp + 5 * 10**7, stamp)
 
 
-def test_what_is_missing_or_no_pose_is_counted_and_said(folders, pack):
+def test_what_is_missing_or_no_pose_is_counted_and_said(poses, pack):
     values = [some_pose(k) for k in range(6)]
     values[1][0, 0] = np.nan
     values[2][:3, :3] *= 1.5
     values[3][:3, 0] *= -1
     for k in (0, 1, 2, 3):
-        np.savetxt(folders[1] / f'{k}.txt', values[k])
-    (folders[1] / '4.txt').write_text('1 2 three')
+        np.savetxt(poses / f'{k}.txt', values[k])
+    (poses / '4.txt').write_text('1 2 three')
     bag, output = pack()
     assert '1 poses, 5 without: 1.txt: values are not finite, and 4 more' in output
     with RecordedTransforms(bag, timeout=1.0) as transforms:
@@ -199,14 +161,6 @@ def test_poses_are_found_by_stem_or_else_by_number(tmp_path):
         match_poses(images, tmp_path)
     with pytest.raises(FileError, match=r'no \.txt files'):
         match_poses(images, tmp_path / 'nowhere')
-
-
-def test_a_pose_is_read_whatever_separates_its_numbers(tmp_path):
-    path = tmp_path / 'pose.txt'
-    path.write_text(', '.join(f'{value:.9f}' for value in some_pose(2).ravel()))
-    found = read_pose(path)
-    assert isinstance(found, Transform)
-    np.testing.assert_allclose(found.rotation, some_pose(2)[:3, :3], atol=1e-8)
 
 
 def test_all_parts_of_a_plane_are_in_its_row():
