@@ -34,8 +34,7 @@ def observed(random, pose, truth, root, lasting):
     """A plane that errs by a pattern (what lasts) and by what is new, as the filter has it."""
     normal = pose.rotation.T @ truth[:3]
     distance = truth[3] + truth[:3] @ pose.shift
-    share = LASTING
-    error = np.sqrt(share) * lasting + np.sqrt(1 - share) * random.standard_normal(3)
+    error = np.sqrt(LASTING) * lasting + np.sqrt(1 - LASTING) * random.standard_normal(3)
     theta = -normal / distance + root @ error
     distance = 1 / np.linalg.norm(theta)
     normal = -theta * distance
@@ -59,7 +58,6 @@ def test_the_filter_knows_how_far_it_is_off(pattern):
     values, errors = [], []
     for _ in range(60):
         root = 0.003 * random.standard_normal((3, 3))
-        root = (root + root.T) / 2
         lasting, filters = random.standard_normal(3), None
         for k in range(15):
             turn = Rotation.from_rotvec(random.normal(0, 0.1, 3))
@@ -67,10 +65,8 @@ def test_the_filter_knows_how_far_it_is_off(pattern):
             pose = Transform(turn.as_matrix(), np.array([random.uniform(-1, 1), -1, 1.2]))
             if pattern == 'changes':
                 lasting = random.standard_normal(3)
-            values_, vectors = np.linalg.eigh(root @ root)
-            plane = observed(random, pose, truth, vectors * np.sqrt(values_) @ vectors.T, lasting)
-            off = Rotation.from_rotvec(random.normal(0, NOISE.turn, 3)).as_matrix()
-            told = Transform(off @ pose.rotation, pose.shift + random.normal(0, NOISE.shift, 3))
+            plane = observed(random, pose, truth, root, lasting)
+            told = pose.by(random.normal(0, NOISE.deviations))
             view = np.eye(15)[[k if pattern == 'changes' else 0]]
             seen = observations([plane], view, told, NOISE)
             filters = filters or PlaneFilters.of(seen)
@@ -93,7 +89,7 @@ def pose_of(pose):
     return Transform(pose.rotation, pose.position)
 
 
-def add(plane_map, scene, k, random, apart=False):
+def add(plane_map, scene, k, random):
     """Take in the true regions of a frame, with noise on the pose."""
     image, view = image_and_truth(scene, k, len(scene.solids))
     planes = with_roles(fit_planes(view.labels, image, SENSOR), Config(), (0, -1, 0))
@@ -101,8 +97,6 @@ def add(plane_map, scene, k, random, apart=False):
     planes = [
         replace(plane, id=1000 * (k + 1) + plane.label) for plane in planes if plane.count > 100
     ]
-    if apart:
-        planes = [replace(plane, surface=plane.label) for plane in planes]
     pose = scene.poses[k]
     off = Rotation.from_rotvec(random.normal(0, NOISE.turn, 3)).as_matrix()
     told = Transform(off @ pose.rotation, pose.position + random.normal(0, NOISE.shift, 3))
@@ -138,20 +132,6 @@ def test_a_walk_maps_every_face_once_and_better_than_single_frames(seed):
             np.testing.assert_allclose(ring @ plane.normal + plane.distance, 0, atol=1e-6)
 
 
-def test_what_a_frame_finds_on_two_surfaces_is_not_one_plane():
-    # A step so low that the errors of the sensor and of the pose would hide it.
-    step = box((1.0, 2.0, 0.04), np.eye(3), (3.0, 0, 0.02))
-    poses = [Pose.looking((0.05 * k, 0, 1.4), 0, 25, 0) for k in range(12)]
-    scene = Scene((half_space((0, 0, 1), (0, 0, 0)), step), tuple(poses))
-    random, plane_map = np.random.default_rng(0), PlaneMap()
-    for k in range(len(poses)):
-        add(plane_map, scene, k, random, apart=True)
-    flat = [plane for plane in plane_map.planes if plane.normal[2] > 0.9]
-    assert len(flat) == 2
-    low, high = sorted(flat, key=lambda plane: plane.centroid[2])
-    assert low.centroid[2] < 0.02 < high.centroid[2]
-
-
 def test_parts_that_turn_out_to_be_one_surface_become_one_plane():
     pose = Pose.looking((0, 0, 1.2), 0, 0, 0)
     image, view = image_and_truth(Scene((half_space((-1, 0, 0), (2.5, 0, 0)),), (pose,)))
@@ -163,13 +143,14 @@ def test_parts_that_turn_out_to_be_one_surface_become_one_plane():
     for k in range(8):
         planes = [
             replace(plane, id=10 * k + plane.label, surface=plane.label if k < 4 else 1)
-            for plane in parts
+            for plane in parts[: k + 1]
         ]
         plane_map.add(labels, planes, image, pose_of(pose), 10**9 + k * 10**8)
         counts.append(len(plane_map))
+    # Not what a frame finds on two surfaces, though the second one is new.
     assert counts[3] == 2
     (wall,) = plane_map.planes
-    assert wall.observations == 2 * 8
+    assert wall.observations == 2 * 8 - 1
     assert wall.area == pytest.approx(sum(plane.area for plane in parts), rel=0.15)
 
 
@@ -214,8 +195,7 @@ def test_the_map_follows_a_jump_of_the_fixed_frame(turn):
     assert before.keys() <= after.keys()
     for number, plane in before.items():
         normal = jump.rotation @ plane.normal
-        offset = (normal - after[number].normal) @ after[number].centroid
-        offset += plane.distance - normal @ jump.shift - after[number].distance
+        offset = normal @ (after[number].centroid - jump.shift) + plane.distance
         assert np.degrees(np.arccos(min(1, normal @ after[number].normal))) < 1.5
         assert abs(offset) < 0.03
 
@@ -283,56 +263,44 @@ def test_frames_without_stamps_make_a_map():
     assert areas[1] > 1.02 * areas[0]
 
 
-def test_another_size_of_images_goes_on_with_the_map():
+def test_another_size_of_images_and_parameters_changed_while_running_keep_the_map():
     sequence, ids = SequenceSegmenter(CONFIG), []
     for n, k in enumerate(range(0, 40, 4)):
+        if n == 5:
+            sequence.config = Config(min_pixels=200, map_resolution=0.1, distortion_length=20.0)
         image, pose = seen(k, 320 if n < 5 else 240)
         sequence.segment(image, 10**9 + k * 10**9 // 30, pose=pose)
         ids.append(ids_of(sequence))
     assert 3 < len(ids[4]) <= len(ids[4] & ids[-1]) + 1 and len(ids[-1]) <= len(ids[4]) + 3
-
-
-def test_parameters_changed_while_running_keep_the_map():
-    sequence = SequenceSegmenter(CONFIG)
-    for n, k in enumerate(range(0, 40, 4)):
-        if n == 5:
-            before = ids_of(sequence)
-            sequence.config = Config(min_pixels=300, map_resolution=0.1, distortion_length=20.0)
-        image, pose = seen(k)
-        sequence.segment(image, 10**9 + k * 10**9 // 30, pose=pose)
-    assert 3 < len(before) <= len(before & ids_of(sequence)) + 1 and sequence.map.begun_anew == ''
+    assert sequence.map.begun_anew == ''
     # Another frame is another map.
-    sequence.config = Config(min_pixels=300, fixed_frame='odom')
+    sequence.config = Config(fixed_frame='odom')
     assert len(sequence.map) == 0 and sequence.map.begun_anew == 'its frame has changed'
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize('kind', ['returns', 'goes on'])
-def test_memory_is_bounded_however_long_one_walks(kind):
-    camera, random = kinect_camera(80, 60), np.random.default_rng(0)
-    solids = [half_space((0, 0, 1), (0, 0, 0)), half_space((0, 1, 0), (0, -1.6, 0))]
-    solids += [box((0.6, 0.4, 0.7), np.eye(3), (x, 0.9, 0.35)) for x in (3.0, 5.0, 7.0)]
-    along = np.concatenate([np.linspace(0, 4, 12), np.linspace(4, 0, 12)])
-    poses = [Pose.looking((x, 0, 1.2), 12 * np.sin(x), 22, 0) for x in along]
-    frames = []
-    for pose in poses:
-        image, view = image_and_truth(Scene(tuple(solids), (pose,)), camera=camera)
-        planes = fit_planes(view.labels, image, SENSOR)
-        frames.append((view.labels, [p for p in planes if p.count > 40], image))
-    plane_map, kept, sizes = PlaneMap(Config(map_planes=12)), [], []
-    for n in range(9 * len(frames)):
-        (labels, planes, image), pose = frames[n % len(frames)], poses[n % len(frames)]
-        # Where it goes on, each round is past the next three of a row of boxes.
-        shift = pose.position + random.normal(0, 0.005, 3)
-        shift[0] += 6 * (n // len(frames)) * (kind == 'goes on')
-        plane_map.add(labels, planes, image, Transform(pose.rotation, shift), (n + 1) * 10**8)
-        kept.append(len(plane_map))
-        if n % len(frames) == len(frames) - 1:
-            sizes.append(len(pickle.dumps(plane_map)))
-    assert kept[-1] > 5 and max(kept) <= 12
-    assert max(kept) > 9 or kind == 'returns'
-    # All that it holds; grids on planes that go on grow up to their bound.
-    assert max(sizes[6:]) < 1.1 * max(sizes[3:6]) or kind == 'goes on'
+def test_of_too_many_planes_those_out_of_sight_the_longest_are_forgotten():
+    """Two walls side by side, 10 m farther every time; of those seen last alike, the seldom."""
+    labels = np.ones(CAMERA.shape, np.uint16)
+    labels[:, 80:] = 2
+    image = RangeImage.from_depth(1.0 + labels, CAMERA)
+    walls = fit_planes(labels, image, SENSOR)
+    plane_map, kept, sizes = PlaneMap(Config(map_planes=3)), [], []
+
+    def visit(place, planes):
+        planes = [replace(plane, id=10 * place + plane.label) for plane in planes]
+        pose = Transform(np.eye(3), np.array([0, 0, 10.0 * place]))
+        plane_map.add(labels, planes, image, pose, 0)
+
+    for _ in range(8):
+        visit(0, walls[1:])  # once oftener than the other one
+        for place in range(3):
+            for _ in range(3):
+                visit(place, walls)
+            kept.append(sorted(round(plane.distance) for plane in plane_map.planes))
+        sizes.append(len(pickle.dumps(plane_map)))
+    assert kept[:3] == [[2, 3], [3, 12, 13], [12, 22, 23]]
+    # All that it holds.
+    assert max(sizes) < 1.02 * sizes[1]
 
 
 def test_a_grid_is_bounded_however_far_a_plane_goes():
