@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from planes_of_labels import fit_planes, painted
 from scipy.spatial.transform import Rotation
 from tracks import ids_of_faces, track_figures
@@ -72,14 +70,13 @@ def test_a_hidden_plane_moves_along_with_the_camera():
 
 
 def test_moved_planes_still_hold_their_points():
-    labels, planes = frame(*STAY)
-    tracks = Tracks.of(planes, labels)
-    there = tracks.moved(Rotation.from_rotvec([0.3, -0.2, 0.1]).as_matrix(), np.array([1, 2, 3.0]))
+    tracks, shift = Tracks.of(*reversed(frame(*STAY))), np.array([1, 2, 3.0])
+    rotation = Rotation.from_rotvec([0.3, -0.2, 0.1]).as_matrix()
+    there = tracks.moved(rotation, shift)
+    np.testing.assert_allclose(there.centroid, tracks.centroid @ rotation.T + shift)
     np.testing.assert_allclose(np.linalg.norm(there.plane[:, :3], axis=1), 1)
     off = [(t.plane[:, :3] * t.centroid).sum(axis=1) + t.plane[:, 3] for t in (tracks, there)]
     np.testing.assert_allclose(off[0], off[1], atol=1e-12)
-    apart = [np.linalg.norm(t.centroid - t.centroid[0], axis=1) for t in (tracks, there)]
-    np.testing.assert_allclose(apart[0], apart[1])
 
 
 def test_what_moves_by_itself_does_not_move_the_camera():
@@ -184,37 +181,8 @@ def test_a_reset_and_another_image_size_begin_anew_without_reusing_ids():
     assert ids(tracker, (labels[::2, ::2], planes)) == [4, 5, 6]
     tracker.reset()
     assert ids(tracker, (labels[::2, ::2], planes)) == [7, 8, 9]
+    assert ids(tracker, (labels[::2, ::2], [])) == []
     assert ids(tracker, (labels[::2, ::2], planes)) == [7, 8, 9]
-
-
-REGION = st.tuples(
-    st.integers(0, 110),
-    st.integers(0, 150),
-    st.integers(5, 60),
-    st.integers(5, 80),
-    st.sampled_from([FLOOR, WALL, SIDE, BOX, (0.0, -0.1, -0.995, 1.0)]),
-)
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.lists(st.tuples(st.booleans(), st.lists(REGION, max_size=6)), max_size=8))
-def test_whatever_comes_ids_are_unique_new_after_a_reset_and_the_same_again(sequence):
-    frames = [
-        (reset, frame(*((slice(i, i + h), slice(j, j + w), p) for i, j, h, w, p in regions)))
-        for reset, regions in sequence
-    ]
-    tracker, again = (Tracker(Config(track_time=2.5 / 30)) for _ in range(2))
-    used = set()
-    for reset, found in frames:
-        if reset:
-            tracker.reset()
-            again.reset()
-        now = ids(tracker, found)
-        assert now == ids(again, found) and len(set(now)) == len(now)
-        if reset:
-            assert not used & set(now)
-        used |= set(now)
-    assert used == set(range(1, len(used) + 1))
 
 
 @pytest.mark.parametrize('seed', [0, 5])
