@@ -13,8 +13,7 @@ def plane(number, normal, at, sigma, size=2.0):
     along /= np.linalg.norm(along)
     axes = np.stack([along, np.cross(normal, along)])
     corners = at + size / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ axes
-    jacobian = np.zeros((4, 3))
-    jacobian[:3, :2], jacobian[3, :2], jacobian[3, 2] = axes.T, -axes @ at, 1
+    jacobian = np.block([[axes.T, np.zeros((3, 1))], [-axes @ at, 1]])
     covariance = jacobian @ np.diag([sigma**2, sigma**2, 1e-6]) @ jacobian.T
     shape = Shape(size**2, np.array([size, size]), np.array(at), np.eye(3))
     return MapPlane(

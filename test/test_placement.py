@@ -1,11 +1,14 @@
 """Where a camera is: frames, the accelerometer, the parameters; and how it is mounted."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from map_squares import plane
 from planes_of_labels import painted
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from rangeseg_ros import Camera, Config, RangeImage
 from rangeseg_ros.core.mapping.map_planes import moved_planes
@@ -17,7 +20,7 @@ from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import OPTICAL_IN_BODY, Pose, Scene
 from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
-from rangeseg_ros.simulation.solids import box, half_space
+from rangeseg_ros.simulation.solids import half_space
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 PITCH = Rotation.from_euler('y', 30, degrees=True)
@@ -127,76 +130,66 @@ def test_the_last_up_is_held_while_a_slope_can_be_told_from_level_ground():
 
 @pytest.mark.parametrize('sd', [(1.5, 1.5), (1.5, 3.6), (4.0, 0.5)])
 def test_directions_are_weighted_by_their_precision_unless_they_contradict(sd):
-    """The mean of 4000 pairs of such errors has the error told; one of 1000 contradicts."""
-    draw, filtered, config = np.random.default_rng(1), UpFilter(), Config()
-    found, lost, ahead = [], 0, np.array([0.0, 0, 1])
-    for _ in range(4000):
-        errors = [np.append(draw.normal(0, np.radians(s), 2), 0) for s in sd]
-        ups = [
-            Up((e + ahead) / np.linalg.norm(e + ahead), s, name)
-            for e, s, name in zip(errors, sd, ('tf', 'imu'), strict=True)
-        ]
-        placed = filtered.settle(Placement(ups=ups, asked=True, sources={'up': ''}), 0, config)
-        lost += bool(placed.lost)
-        if not placed.lost:
-            found.append([*np.degrees(placed.up[:2]), placed.up_sd])
-    x, y, told = np.array(found).T
-    assert told[0] == pytest.approx(np.prod(sd) / np.hypot(*sd)) and np.ptp(told) == 0
-    assert np.std([x, y]) == pytest.approx(told[0], rel=0.05)
-    assert 0 < lost < 12
-    apart = [Up(ahead, sd[0], 'tf'), Up(np.array([0, 0.6, 0.8]), sd[1], 'imu')]
-    placed = filtered.settle(Placement(ups=apart, asked=True, sources={'up': ''}), 1, config)
-    assert 'tf and imu are 37 degrees apart' in placed.lost and placed.up is None
+    """Errors about two axes are that far apart once in a thousand times."""
+    limit = np.hypot(*sd) * np.sqrt(chi2.ppf(0.999, 2))
+    for angle in (0.99 * limit, 1.01 * limit):
+        imu = Rotation.from_euler('x', -angle, degrees=True).apply((0, 0, 1))
+        ups = [Up(np.array([0.0, 0, 1]), sd[0], 'tf'), Up(imu, sd[1], 'imu')]
+        found = Placement(ups=ups, asked=True, sources={'up': ''})
+        placed = UpFilter().settle(found, 1, Config())
+        if angle > limit:
+            assert f'tf and imu are {angle:.0f} degrees apart' in placed.lost and placed.up is None
+        else:
+            assert not placed.lost and np.linalg.norm(placed.up) == pytest.approx(1)
+            assert placed.up_sd == pytest.approx(np.prod(sd) / np.hypot(*sd))
+            share = np.degrees(np.arctan2(placed.up[1], placed.up[2])) / angle
+            assert share == pytest.approx(sd[0] ** 2 / (sd[0] ** 2 + sd[1] ** 2), rel=0.01)
 
 
-MOUNTED = kinect_camera(320, 240)
-
-
-def driving(height, pitch, roll, frames=6):
-    """A robot drives past a box, towards a wall."""
-    solids = half_space((0, 0, 1), (0, 0, 0)), half_space((-1, 0, 0), (4, 0, 0))
-    cube = box((0.4, 0.4, 0.3), np.eye(3), (2.2, 0.7, 0.15))
-    poses = [Pose.looking((0.1 * k, 0, height), 0, pitch, roll) for k in range(frames)]
-    return Scene((*solids, cube), tuple(poses))
-
-
-@pytest.mark.parametrize(('height', 'pitch', 'roll'), [(1.1, 25, 3), (0.9, 40, -6), (1.4, 30, 0)])
-def test_angles_and_height_are_within_their_errors(height, pitch, roll):
-    scene, sequence = driving(height, pitch, roll), SequenceSegmenter(Config(min_pixels=150))
-    for k in range(len(scene.poses)):
-        view = simulate(scene, Kinect(int(height * 10)), MOUNTED, frame=k)
-        image = RangeImage.from_depth(view.depth, MOUNTED)
-        sequence.segment(image, 10**9 + k * 10**8, pose=Transform.identity())
-    mount = mount_of(sequence.map.planes, len(scene.poses), 10.0)
-    assert not mount.doubts
-    stated = *np.radians([roll, pitch]), height
-    error = np.abs(np.subtract([mount.roll, mount.pitch, mount.height], stated))
-    assert (error < [np.radians(1), np.radians(1), 0.02]).all() and (error < 4 * mount.sigma).all()
+@pytest.mark.parametrize(('height', 'pitch', 'roll'), [(1.1, 25, 3), (0.9, 40, -20), (1.4, 30, 0)])
+def test_the_mount_is_that_above_the_largest_plane_that_faces_up(height, pitch, roll):
+    truth = Pose.looking((0, 0, height), 0, pitch, roll).rotation
+    up, ahead = truth[2], truth[0]
+    floor = plane(1, up, 2 * ahead - height * up, 0.01, 3.0)
+    others = [plane(2, -ahead, 4 * ahead, 0.01, 9.0), plane(3, up, -0.5 * up, 0.01, 1.0)]
+    mount = mount_of([*others, floor], 18, 10.0)
+    assert [mount.roll, mount.pitch] == pytest.approx(np.radians([roll, pitch]), abs=1e-9)
+    assert mount.height == pytest.approx(height) and not mount.doubts
     # As what draws from the covariance of the floor scatter by.
-    floor = max(sequence.map.planes, key=lambda plane: -plane.normal[1] * plane.area)
     mean, random = np.append(floor.normal, floor.distance), np.random.default_rng(0)
     x, y, z, drawn = random.multivariate_normal(mean, floor.covariance, 20000).T
     angles = np.arctan2(-x, -y), np.arcsin(-z / np.sqrt(x**2 + y**2 + z**2))
     assert mount.sigma == pytest.approx(np.std([*angles, drawn], axis=1), rel=0.05)
     # The camera's place in the frame on the floor, x forward.
-    truth = scene.poses[0].rotation
-    np.testing.assert_allclose(mount.rotation, truth, atol=0.03)
     for turn in (Rotation.from_euler('xyz', mount.rpy), Rotation.from_quat(mount.quaternion)):
-        np.testing.assert_allclose(turn.as_matrix(), mount.rotation, atol=1e-9)
+        np.testing.assert_allclose(turn.as_matrix(), truth, atol=1e-9)
+    table = plane(4, up, -0.5 * up, 0.01, 2.8)
+    least = np.degrees(mount.sigma[:2].max())
+    for planes, frames, tolerance, doubt in (
+        ([floor], 19, 10.0, 'it was found in 9 of 19 frames'),
+        ([table, floor], 18, 10.0, 'a plane 0.50 m below the camera may be the floor as well'),
+        ([floor], 18, 1.5, f'its direction is known to {least:.1f} degrees only'),
+    ):
+        assert mount_of(planes, frames, tolerance).doubts == [doubt]
 
 
 def test_the_command_prints_what_ros_takes_and_says_when_there_is_no_floor(tmp_path, run):
-    scene = driving(1.1, 25, 3, frames=4)
-    for name, pose in (('robot', None), ('wall', Pose.looking((0, 0, 1.5), 0, -20, 0))):
-        with DepthBagWriter(tmp_path / name, MOUNTED) as bag:
-            for k in range(4):
-                shown = Scene(scene.solids, (pose or scene.poses[k],))
-                bag.write(simulate(shown, Kinect(0), MOUNTED).depth, 10**9 + k * 10**8)
-    params = tmp_path / 'params.yaml'
-    params.write_text('min_pixels: 150')
-    robot, wall = (run('mount', tmp_path / name, '--params', params) for name in ('robot', 'wall'))
-    code, output, _ = robot
+    """A robot drives towards a wall; another camera sees the wall alone."""
+    solids = half_space((0, 0, 1), (0, 0, 0)), half_space((-1, 0, 0), (4, 0, 0))
+    robot = [Pose.looking((0.1 * k, 0, 1.1), 0, 25, 3) for k in range(4)]
+    outcomes, camera = [], kinect_camera(320, 240)
+    for name, poses in (('robot', robot), ('wall', [Pose.looking((0, 0, 1.5), 0, -20, 0)])):
+        with DepthBagWriter(tmp_path / name, camera) as bag:
+            for k in range(len(poses)):
+                view = simulate(Scene(solids, tuple(poses)), Kinect(0), camera, frame=k)
+                bag.write(view.depth, 10**9 + k * 10**8)
+        outcomes.append(run('mount', tmp_path / name))
+    (code, output, _), wall = outcomes
     assert code == 0
+    told = re.findall(r'^(?:roll|pitch|height) (\S+) \+- (\S+)', output, re.MULTILINE)
+    values, sigma = np.array(told, float).T
+    error = np.abs(values - (3, 25, 1.1))
+    assert (error < (1, 1, 0.02)).all() and (error < 4 * sigma).all()
     assert '--frame-id base_footprint --child-frame-id camera_depth_optical_frame' in output
-    assert '<origin xyz="0 0 1.' in output and 'pitch 2' in output
+    assert '<origin xyz="0 0 1.' in output
     assert wall[0] == 2 and 'no plane that faces up' in wall[2]
