@@ -33,11 +33,6 @@ def tilted(degrees):
 UP, DOWN, AHEAD = tilted(0), tilted(180), tilted(90)
 
 
-def test_room():
-    found = planes((BOTTOM, UP, 1.2), (LEFT, AHEAD, 3), (RIGHT, (-1, 0, -1), 3), (TOP, DOWN, 1.3))
-    assert roles(found, LEVEL) == ['floor', 'wall', 'wall', 'ceiling']
-
-
 def test_the_floor_is_the_surface_at_the_stated_height():
     """Whatever reaches nearer, or lies lower: a table in front, the landing below a drop."""
     near, far = slice(95, 120), slice(65, 90)

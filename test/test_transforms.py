@@ -1,5 +1,7 @@
 """Transforms against motions in closed form, rotations and quantiles as SciPy has them."""
 
+from itertools import cycle
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -30,9 +32,7 @@ class Motion:
 
     def matrix(self, seconds):
         turn, place = self.at(seconds)
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = turn.as_matrix(), place
-        return matrix
+        return matrix_of((turn.as_matrix(), place))
 
 
 def matrix_of(transform):
@@ -41,11 +41,10 @@ def matrix_of(transform):
     return matrix
 
 
-def fill(buffer, parent, child, motion, stamps, flip=None):
-    for k, stamp in enumerate(stamps):
+def fill(buffer, parent, child, motion, stamps, signs=(1,)):
+    """Take in samples of a motion; q and -q are one rotation."""
+    for stamp, sign in zip(stamps, cycle(signs), strict=False):
         turn, place = motion.at(stamp / SECOND)
-        # q and -q are one rotation.
-        sign = -1 if flip is not None and flip[k % len(flip)] else 1
         buffer.insert(parent, child, stamp, sign * turn.as_quat(), place)
 
 
@@ -54,7 +53,7 @@ def fill(buffer, parent, child, motion, stamps, flip=None):
 def test_lookups_in_random_trees_equal_the_closed_form(data):
     count = data.draw(st.integers(2, 8))
     parents = [data.draw(st.integers(0, k - 1)) for k in range(1, count)]
-    flips = data.draw(st.lists(st.booleans(), min_size=1, max_size=5))
+    signs = data.draw(st.lists(st.sampled_from([1, -1]), min_size=1, max_size=5))
     seed = data.draw(st.integers(0, 10**6))
     times = data.draw(st.lists(st.integers(1, 5 * SECOND), min_size=1, max_size=12, unique=True))
     # A fifth of a second apart, so that no turn is near half a revolution; in any order.
@@ -68,7 +67,7 @@ def test_lookups_in_random_trees_equal_the_closed_form(data):
             turn, place = motion.at(0)
             buffer.insert(f'f{parent}', f'f{k}', 0, turn.as_quat(), place, static=True)
         else:
-            fill(buffer, f'f{parent}', f'f{k}', motion, order, flips)
+            fill(buffer, f'f{parent}', f'f{k}', motion, order, signs)
 
     def to_root(k, seconds):
         matrix = np.eye(4)
