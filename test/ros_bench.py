@@ -7,18 +7,19 @@ import sys
 import tempfile
 import time
 from array import array
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 import numpy as np
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from message_classes import cdr
-from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosbags import rosbag2
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from std_msgs.msg import Header
 
 from rangeseg_ros.messages.make import message_class
 from rangeseg_ros.messages.motion import ODOMETRY
@@ -32,10 +33,6 @@ BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 DEPTH, INFO = '/depth/image_rect', '/depth/camera_info'
 NODE = [sys.executable, '-c', 'from rangeseg_ros.start import segment_planes; segment_planes()']
 FRAME = 'camera_depth_optical_frame'
-SERVICES = (
-    ('set_parameters', SetParameters),
-    ('set_parameters_atomically', SetParametersAtomically),
-)
 
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
@@ -99,7 +96,7 @@ def benches(*outputs, **parameters):
     return node, bench
 
 
-class Bench:
+class Bench(AbstractContextManager):
     """Starts `segment_planes` and talks to it."""
 
     def __init__(
@@ -131,9 +128,8 @@ class Bench:
         self.name = f'{namespace}/{name}'.lstrip('/')
         kind, callback = DiagnosticArray, self._on_diagnostics
         self.node.create_subscription(kind, '/diagnostics', callback, RELIABLE)
-        self.clients = [
-            self.node.create_client(kind, f'/{self.name}/{service}') for service, kind in SERVICES
-        ]
+        service = f'/{self.name}/set_parameters_atomically'
+        self.client = self.node.create_client(SetParametersAtomically, service)
 
     @contextmanager
     def listening(self, *names):
@@ -190,12 +186,8 @@ class Bench:
 
     def ignored(self, topic):
         """Wait until the node does not subscribe; one that has ended does not."""
-        self.until(
-            lambda: (
-                self.process.poll() is not None
-                or not self.node.get_subscriptions_info_by_topic(topic)
-            )
-        )
+        endpoints = self.node.get_subscriptions_info_by_topic
+        self.until(lambda: self.process.poll() is not None or not endpoints(topic))
 
     def segment(self, image=None, info=None):
         """Publish an image with its camera_info; the labels (H, W) that come back."""
@@ -208,21 +200,21 @@ class Bench:
         self.camera_info.publish(info or self.info())
         self.depth.publish(image or self.image())
 
-    def repeat(self, action, condition, period=0.2):
-        """Do something again and again until the condition holds; its value."""
+    def repeat(self, action, condition):
+        """Do something five times a second until the condition holds; its value."""
         due = 0.0
 
         def found():
             nonlocal due
             if time.monotonic() >= due:
-                due = time.monotonic() + period
+                due = time.monotonic() + 0.2
                 action()
             return condition()
 
         return self.until(found)
 
-    def reported(self, condition, publish):
-        """The first diagnostic status that satisfies the condition, while frames come."""
+    def status(self, condition, publish=lambda: None):
+        """The first diagnostic status from now on that satisfies the condition."""
         self.received['diagnostics'].clear()
 
         def found():
@@ -234,14 +226,16 @@ class Bench:
     def stream(self):
         """Publish images until one comes back, as best effort has no promise for the first."""
 
-        def answer():
+        sent = []
+
+        def publish():
             sent.append(self.image())
             self.send(sent[-1])
-            self.spin(0.1)
+
+        def answered():
             return next((image for image in sent if self.find('labels', image)), None)
 
-        sent = []
-        return self.labels_of(self.until(answer))
+        return self.labels_of(self.repeat(publish, answered))
 
     def spin(self, seconds):
         end = time.monotonic() + seconds
@@ -261,10 +255,7 @@ class Bench:
 
     def header(self):
         """Header with a stamp of its own."""
-        message = Image()
-        message.header.stamp = self.node.get_clock().now().to_msg()
-        message.header.frame_id = FRAME
-        return message.header
+        return Header(stamp=self.node.get_clock().now().to_msg(), frame_id=FRAME)
 
     def image(self, depth=None, encoding='16UC1', **fields):
         """Depth image message, by default of two walls."""
@@ -293,18 +284,17 @@ class Bench:
         """That message once it is there."""
         return self.until(lambda: self.find(name, image))
 
-    def status(self, condition):
-        """The first diagnostic status from now on that satisfies the condition."""
-        return self.reported(condition, lambda: None)
-
-    def set_parameters(self, atomically=False, **values):
-        """Set parameters by the node's service; its results."""
-        client = self.clients[atomically]
-        parameters = [Parameter(n, value=v).to_parameter_msg() for n, v in values.items()]
+    def call(self, client, **fields):
+        """The response of a service to a request."""
         self.until(client.service_is_ready)
-        future = client.call_async(client.srv_type.Request(parameters=parameters))
+        future = client.call_async(client.srv_type.Request(**fields))
         self.until(future.done)
-        return future.result().result if atomically else future.result().results
+        return future.result()
+
+    def set_parameters(self, **values):
+        """Set parameters by the node's service, which must take them."""
+        parameters = [Parameter(n, value=v).to_parameter_msg() for n, v in values.items()]
+        assert self.call(self.client, parameters=parameters).result.successful
 
     def in_use(self):
         """Wait until the parameters that were set have the kernels they need."""
@@ -330,7 +320,7 @@ class Bench:
         """Press Ctrl-C."""
         os.killpg(self.process.pid, signal.SIGINT)
 
-    def close(self):
+    def __exit__(self, *exception):
         """Stop the node, which must end well."""
         try:
             if self.process.poll() is None:
@@ -345,9 +335,3 @@ class Bench:
             self.node.destroy_node()
             rclpy.try_shutdown(context=self.context)
         assert code == 0 and 'Traceback' not in self.log(), f'exit code {code}: {self.log()}'
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exception):
-        self.close()

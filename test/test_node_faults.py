@@ -31,7 +31,7 @@ def assert_segments(bench):
 
 def error_about(bench, words, message=None):
     """Wait for an error of the diagnostics that says so, about an image sent until it is there."""
-    bench.reported(
+    bench.status(
         lambda status: status.level == DiagnosticStatus.ERROR and words in status.message,
         lambda: message and bench.depth.publish(message),
     )
@@ -65,34 +65,6 @@ def test_malformed_image(bench, fields, words):
     bench.camera_info.publish(bench.info())
     error_about(bench, words, bench.image(**fields))
     assert_segments(bench)
-
-
-def test_frame_without_valid_depth(bench):
-    image = bench.image(np.full((120, 160), np.nan, np.float32), '32FC1')
-    assert not bench.segment(image).any()
-    status = bench.reported(
-        lambda status: status.message == 'Nothing in the image is measured.',
-        lambda: bench.depth.publish(image),
-    )
-    assert status.level == DiagnosticStatus.WARN
-    assert_segments(bench)
-
-
-def test_size_and_encoding_change_in_midstream(bench):
-    for width, height, encoding in [
-        (160, 120, '16UC1'),
-        (212, 121, '32FC1'),
-        (1, 1, '16UC1'),
-        (106, 60, 'mono16'),
-        (160, 120, '32FC1'),
-    ]:
-        camera = kinect_camera(width, height)
-        depth = corner_depth(camera)
-        if encoding == '32FC1':
-            depth = (depth / 1000).astype(np.float32)
-        labels = bench.segment(bench.image(depth, encoding), bench.info(camera))
-        assert labels.shape == (height, width)
-        assert len(set(labels.ravel()) - {0}) == (0 if width == 1 else 2)
 
 
 def test_a_topic_of_another_type_is_told(node):

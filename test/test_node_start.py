@@ -36,7 +36,7 @@ def test_a_first_start_says_that_it_compiles(tmp_path, monkeypatch):
     monkeypatch.setenv('NUMBA_CACHE_DIR', os.fspath(tmp_path))
     with started(stall_timeout=0.5, namespace='first') as bench:
         told = r'no output for .* s: compiling kernels'
-        status = bench.reported(lambda s: re.match(told, s.message), bench.send)
+        status = bench.status(lambda s: re.match(told, s.message), bench.send)
         assert status.level == DiagnosticStatus.ERROR
         assert 'compiling kernels' in bench.log()
         assert 'will subscribe to {} and {}'.format(*bench.topics) in bench.log()
@@ -57,6 +57,9 @@ def test_interrupted_during_a_computation(presses):
 
 BAD = {
     "is 'min_pixels' meant?": ('--ros-args', '-p', 'min_pixel:=3'),
+    'smoothness': ('--ros-args', '-p', 'smoothness:=true'),
+    "'DOUBLE', such as 3.0": ('--ros-args', '-p', 'smoothness:=3'),
+    'parameter method must be one of': ('--ros-args', '-p', 'method:=magic'),
     'parameter mask: /none.png': ('--ros-args', '-p', 'mask:=/none.png'),
     'reliable, best_effort': ('--ros-args', '-p', f'{QOS}.reliability:=best'),
     'number of messages': ('--ros-args', '-p', f'{QOS}.depth:=-1'),
@@ -115,15 +118,13 @@ def test_help_names_every_parameter():
     assert all(f'  {field.name} (default' in run.stdout for field in fields(NodeConfig))
 
 
-def assert_ends_well(process):
-    """After an interrupt."""
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=300)
-    assert 'Traceback' not in errors and process.returncode in (0, 130), errors
-
-
-@pytest.mark.parametrize('delay', [0.0, 1.2])
-@pytest.mark.parametrize('command', ['segment_planes', 'rangeseg'])
+@pytest.mark.parametrize(
+    'command, delay',
+    [
+        *(('rangeseg', 0.0), ('rangeseg', 1.2), ('segment_planes', 0.0), ('segment_planes', 1.2)),
+        ('segment_planes', 'as it begins to spin'),
+    ],
+)
 def test_interrupted_at_the_start(command, delay, tmp_path):
     code = f'from rangeseg_ros.start import {command}; print("begun", flush=True); {command}()'
     arguments = ['bench', '--rounds', '99'] if command == 'rangeseg' else []
@@ -138,12 +139,10 @@ def test_interrupted_at_the_start(command, delay, tmp_path):
     with ended(process):
         # Before that Python itself is not ready.
         assert process.stdout.readline() == 'begun\n'
-        time.sleep(delay)
-        assert_ends_well(process)
-
-
-def test_interrupted_as_it_begins_to_spin():
-    process = subprocess.Popen(NODE, stderr=subprocess.PIPE, text=True)
-    with ended(process):
-        assert 'will subscribe' in process.stderr.readline()
-        assert_ends_well(process)
+        if isinstance(delay, float):
+            time.sleep(delay)
+        else:
+            assert 'will subscribe' in process.stderr.readline()
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=300)
+    assert 'Traceback' not in errors and process.returncode in (0, 130), errors
