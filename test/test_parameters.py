@@ -14,21 +14,20 @@ pytest.importorskip('rclpy')
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.event_handler import PublisherEventCallbacks
-from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from ros_bench import values_of  # and a domain of its own for DDS
 from std_msgs.msg import Empty
 
-from rangeseg_ros import Config, ConfigError
+from rangeseg_ros import Config
 from rangeseg_ros.compilation.preparation import FIRST
 from rangeseg_ros.core.sensing.verdict import Verdict
 from rangeseg_ros.io.params import read_config, read_params
 from rangeseg_ros.ros import settings, throttled_events
 from rangeseg_ros.ros.counting import Losses, Window
 from rangeseg_ros.ros.depth_input import PROFILE_VARIABLE, SEGMENT_SIZE, DepthInput
-from rangeseg_ros.ros.diagnostics import FrameStatistics
+from rangeseg_ros.ros.diagnostics import FrameStatistics, FrameTimes
 from rangeseg_ros.ros.parameters import NodeConfig, bind
 from rangeseg_ros.ros.settings import Settings
 from rangeseg_ros.ros.throttled_events import ThrottledCallbackGroup
@@ -45,21 +44,13 @@ def context():
 
 
 @pytest.fixture
-def node_with(context):
-    nodes = []
-
-    def start(**overrides):
-        parameters = [Parameter(name, value=value) for name, value in overrides.items()]
-        nodes.append(Node('segment_planes', context=context, parameter_overrides=parameters))
-        return nodes[-1]
-
-    yield start
-    for node in nodes:
-        node.destroy_node()
+def node(context):
+    node = Node('segment_planes', context=context)
+    yield node
+    node.destroy_node()
 
 
-def test_every_option_is_a_parameter_with_its_default_range_and_description(node_with):
-    node = node_with()
+def test_every_option_is_a_parameter_with_its_default_range_and_description(node):
     assert bind(node, lambda config: None) == NodeConfig()
     for option in fields(Config):
         assert node.get_parameter(option.name).value == option.default
@@ -67,36 +58,14 @@ def test_every_option_is_a_parameter_with_its_default_range_and_description(node
         assert descriptor.description == option.metadata['description']
         low, high = option.metadata['low'], option.metadata['high']
         ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
-        assert [(r.from_value, r.to_value) for r in ranges] == (
-            [] if low is None else [(low, high)]
-        )
-        assert all(
-            choice in descriptor.additional_constraints for choice in option.metadata['choices']
-        )
+        expected = [] if low is None else [(low, high)]
+        assert [(found.from_value, found.to_value) for found in ranges] == expected
+        constraints = descriptor.additional_constraints
+        assert all(choice in constraints for choice in option.metadata['choices'])
 
 
-def test_start_with_other_values(node_with):
-    node = node_with(smoothness=7.5, exact=True, method='normals')
-    expected = NodeConfig(smoothness=7.5, exact=True, method='normals')
-    assert bind(node, lambda config: None) == expected
-
-
-@pytest.mark.parametrize(
-    ('name', 'value', 'error'),
-    [
-        ('method', 'magic', ConfigError),
-        ('direction_count', 306, ConfigError),
-        ('smoothness', True, InvalidParameterTypeException),
-    ],
-)
-def test_bad_start_values_are_named(node_with, name, value, error):
-    with pytest.raises(error, match=name):
-        bind(node_with(**{name: value}), lambda config: None)
-
-
-def test_changes_apply_all_or_none(node_with):
+def test_changes_apply_all_or_none(node):
     applied = []
-    node = node_with()
     bind(node, applied.append)
 
     def change(**values):
@@ -165,9 +134,11 @@ def test_the_first_frames_wait_for_labels_and_other_outputs_for_their_kernels(co
         came.append(used.ready_for('labels'))
         came.append(used.ready_for('terrain'))
 
-    config = NodeConfig()
-    used = settings_of(config)
-    assert used.in_use() is config
+    first, other = NodeConfig(), NodeConfig(min_pixels=500)
+    used = settings_of(first)
+    assert used.in_use() is first
+    used.want(other)  # needs no other kernels
+    assert used.in_use() is other and not used.pending
     publication = Thread(target=publish)
     publication.start()
     publication.join(0.2)  # it must not end by itself
@@ -178,25 +149,15 @@ def test_the_first_frames_wait_for_labels_and_other_outputs_for_their_kernels(co
     assert set(came[2]) > set(FIRST) and came[3] is True
 
 
-def test_what_needs_no_other_kernels_is_in_use_at_once(compilation):
-    used = settings_of()
-    first = used.in_use()
-    other, normals = NodeConfig(min_pixels=500), NodeConfig(method='normals')
-    used.want(other)
-    assert used.in_use() is other is not first and not used.pending
-    used.want(normals)
-    assert used.in_use() is other and used.pending
-    compilation.release.set()
-    used.close()
-
-
 def test_what_is_asked_for_last_is_in_use_in_the_end(monkeypatch):
     """Also when what was asked for before it is compiled later."""
     first, normals, last = NodeConfig(), NodeConfig(method='normals'), NodeConfig(min_pixels=500)
-    begun, release, changed = Event(), Event(), Event()
+    begun, release, changed, served = Event(), Event(), Event(), []
 
     def prepare(config, kinds, report, outputs):
-        if config.method == 'normals':
+        if config.exact:
+            served.append(used.in_use())
+        elif config.method == 'normals':
             begun.set()
             release.wait()
 
@@ -205,25 +166,26 @@ def test_what_is_asked_for_last_is_in_use_in_the_end(monkeypatch):
     assert used.in_use() is first and used.ready_for('terrain')
     used.want(normals)
     begun.wait()
-    assert used.in_use() is first
+    assert used.in_use() is first and used.pending
     used.want(last)
+    assert used.in_use() is last and not used.pending
     release.set()
-    assert used.in_use() is last
     exact = NodeConfig(method='normals', exact=True)
     changed.clear()
     used.want(exact)
     changed.wait()
-    assert used.in_use() is exact and not used.pending
+    assert served == [last] and used.in_use() is exact and not used.pending
+    used.want(normals)  # whose kernels are there by now
+    assert used.in_use() is normals
     used.close()
 
 
-def test_whoever_waits_is_let_go_at_the_end(monkeypatch):
-    release = Event()
-    monkeypatch.setattr(settings, 'prepare', lambda *arguments: release.wait())
+def test_whoever_waits_is_let_go_at_the_end(compilation):
     used = settings_of()
+    assert used.in_use()
     used.close()
-    assert used.in_use() is None and not used.ready_for('labels')
-    release.set()
+    assert used.in_use() is None and not used.ready_for('terrain')
+    compilation.release.set()
 
 
 def test_what_a_robot_stops_for_comes_first_once_its_kernels_are_there(compilation):
@@ -240,7 +202,7 @@ def test_what_a_robot_stops_for_comes_first_once_its_kernels_are_there(compilati
 @pytest.mark.ros
 def test_events_wait_while_messages_come(context):
     came, group = [], ThrottledCallbackGroup(interval=1e9)
-    node, other = (rclpy.create_node(name, context=context) for name in ('node', 'other'))
+    node = rclpy.create_node('node', context=context)
     events = PublisherEventCallbacks(matched=lambda event: came.append(event.current_count))
     publisher = node.create_publisher(
         Empty, 'topic', 5, event_callbacks=events, callback_group=group
@@ -252,22 +214,18 @@ def test_events_wait_while_messages_come(context):
         while not condition():
             executor.spin_once(timeout_sec=0.01)
 
-    def listen():
-        other.create_subscription(Empty, 'topic', lambda message: None, 5)
-        spin_until(publisher.get_subscription_count)
-
-    listen()
-    spin_until(lambda: came)
+    node.create_subscription(Empty, 'topic', lambda message: None, 5)
+    spin_until(lambda: came == [1])
     group.message_came()
     assert group.can_execute(publisher.event_handlers[0])  # the first has nothing before it
     group.message_came()
-    came.clear()
-    listen()
+    node.create_subscription(Empty, 'topic', lambda message: None, 5)
+    spin_until(lambda: publisher.get_subscription_count() == 2)
     for _ in range(20):
         executor.spin_once(timeout_sec=0.01)
-    assert not came
+    assert came == [1]
     group.look()
-    spin_until(lambda: came)
+    spin_until(lambda: came == [1, 2])
 
 
 def test_the_interval_is_kept(monkeypatch):
@@ -306,27 +264,52 @@ def status(**found):
     return statistics.status('segment_planes', source, 3600.0)
 
 
-def test_ground_and_stairs_are_told():
-    told = {'ground': 'ground 1.20 m below, confidence 0.98', 'stairs': ['up 4 x 0.17 / 0.28 m']}
-    found = status(found=result(**told))
-    assert values_of(found)['ground'] == told['ground']
-    assert values_of(found)['stairs'] == told['stairs'][0] and found.level == DiagnosticStatus.OK
-
-
 def result(verdict=Verdict(), **worked_out):  # noqa: B008
-    known = {'reason': '', 'sensor': '', 'work_budget': 1.0, 'tilt': '', **worked_out}
-    return SimpleNamespace(planes=[1, 2, 3], verdict=verdict, **known)
+    known = {'planes': [1, 2], 'reason': '', 'sensor': '', 'work_budget': 1.0, 'tilt': ''}
+    return SimpleNamespace(verdict=verdict, **{**known, **worked_out})
 
 
-def test_a_wrong_unit_is_an_error_and_an_enlarged_image_a_warning():
-    for reason, level in (
-        ('millimetres in floats', DiagnosticStatus.ERROR),
-        ('range instead of z', DiagnosticStatus.ERROR),
-        ('enlarged x 4', DiagnosticStatus.WARN),
-    ):
-        found = status(found=result(verdict=Verdict((reason,), ('What it is.',))))
-        assert found.level == level and found.message == 'What it is.'
-        assert values_of(found)['input'] == 'What it is.'
+@pytest.mark.parametrize(
+    ('found', 'level', 'message'),
+    [
+        ({}, DiagnosticStatus.OK, '2 planes at 0.0 Hz'),
+        ({'planes': [], 'reason': 'too far'}, DiagnosticStatus.WARN, 'no planes: too far'),
+        *(
+            ({'verdict': Verdict((reason,), ('What it is.',))}, level, 'What it is.')
+            for reason, level in (
+                ('millimetres in floats', DiagnosticStatus.ERROR),
+                ('range instead of z', DiagnosticStatus.ERROR),
+                ('enlarged x 4', DiagnosticStatus.WARN),
+            )
+        ),
+    ],
+)
+def test_what_is_found_is_told_and_what_is_wrong(found, level, message):
+    """A wrong unit is an error, an enlarged image a warning."""
+    worked_out = {'ground': '1.20 m below', 'stairs': ['up 4 x 0.17 / 0.28 m', 'down 3']}
+    told = status(found=result(**found, **worked_out))
+    assert (told.level, told.message) == (level, message)
+    values = values_of(told)
+    assert values['input'] == (message if 'verdict' in found else 'trusted')
+    assert (
+        values['ground'] == '1.20 m below' and values['stairs'] == 'up 4 x 0.17 / 0.28 m, down 3'
+    )
+
+
+@pytest.mark.parametrize('transport', [-1.5, 3.6e6, 3.6e6 + 1, -3.7e6])
+def test_the_latency_is_unknown_where_stamps_are_not_of_the_clock_of_the_node(transport):
+    """They are more than `stall_timeout` apart from it, which is an hour."""
+    times = FrameTimes(transport, 2.0, 3.0, 4.0, 5.0, {'refining': 3.5})
+    values = {
+        name: value for name, value in values_of(status(times=times)).items() if 'ms' in name
+    }
+    parts = {'waiting': 2, 'conversion': 3, 'compute': 4, 'compute: refining': 3.5}
+    expected = {'latency since arrival': 14, **parts, 'publication': 5}
+    if abs(transport) <= 3.6e6:
+        expected |= {'latency': transport + 14, 'transport': transport}
+    else:
+        assert values.pop('latency (ms)').startswith('unknown')
+    assert values == {f'{name} (ms)': f'{time:.2f}' for name, time in expected.items()}
 
 
 def test_lost_messages_are_a_warning_with_their_share_and_what_helps():
