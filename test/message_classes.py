@@ -1,7 +1,10 @@
 """Messages of rosbags and, where there is one, of rclpy."""
 
+from functools import partial
+
 import numpy as np
 import pytest
+from numpy.lib.recfunctions import unstructured_to_structured
 from rosbags.typesys import Stores, get_typestore
 
 from rangeseg_ros.messages.make import make_rclpy
@@ -34,33 +37,25 @@ def header(make=make_rosbags):
 def cloud(points, order='<', padding=0, names='xyz', **changes):
     """PointCloud2 of points (H, W, 3), each with a byte before and padding after it."""
     size = points.dtype.itemsize
+    offsets = [1, 1 + size, 1 + 2 * size]
     dtype = np.dtype(
         {
             'names': list(names),
             'formats': [points.dtype.newbyteorder(order)] * 3,
-            'offsets': [1, 1 + size, 1 + 2 * size],
+            'offsets': offsets,
             'itemsize': 1 + 3 * size + padding,
         }
     )
-    records = np.zeros(points.shape[:2], dtype)
-    for index, name in enumerate(names):
-        records[name] = points[..., index]
-    rows = records.view(np.uint8).reshape(len(records), -1)
+    rows = unstructured_to_structured(points, dtype).view(np.uint8).reshape(len(points), -1)
     rows = np.pad(rows, ((0, 0), (0, padding)))
+    kind = {'datatype': {4: 7, 8: 8}[size], 'count': 1}
+    columns = zip(names, offsets, strict=True)
+    field = partial(make_rosbags, 'sensor_msgs/msg/PointField', **kind)
     fields = {
         'header': header(),
         'height': points.shape[0],
         'width': points.shape[1],
-        'fields': [
-            make_rosbags(
-                'sensor_msgs/msg/PointField',
-                name=name,
-                offset=dtype.fields[name][1],
-                datatype={4: 7, 8: 8}[size],
-                count=1,
-            )
-            for name in names
-        ],
+        'fields': [field(name=name, offset=offset) for name, offset in columns],
         'is_bigendian': order == '>',
         'point_step': dtype.itemsize,
         'row_step': rows.shape[1],

@@ -4,7 +4,7 @@ import runpy
 import sys
 from copy import deepcopy
 from pathlib import Path
-from types import ModuleType
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,10 +15,11 @@ pytest.importorskip('shape_msgs.msg')
 from rclpy.serialization import deserialize_message
 from ros_bench import DEPTH  # noqa: F401 - gives DDS a domain of its own
 from std_msgs.msg import Header
+from visualization_msgs.msg import MarkerArray
 
 from rangeseg_ros import Config, RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
-from rangeseg_ros.messages.make import make_rclpy, message_class
+from rangeseg_ros.messages.make import make_rclpy
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
@@ -27,42 +28,19 @@ pytestmark = pytest.mark.ros
 REPOSITORY = Path(__file__).parents[1]
 
 
-class CollisionObject:
-    """The fields of moveit_msgs/CollisionObject that do not need MoveIt's other packages."""
+class CollisionObject(SimpleNamespace):
+    """Of moveit_msgs/CollisionObject what does not need MoveIt's other packages."""
 
     ADD, REMOVE = b'\x00', b'\x01'
-
-    def __init__(self, header, id, operation=ADD):
-        self.header, self.id, self.operation = header, id, operation
-        self.meshes, self.mesh_poses, self.planes, self.plane_poses = [], [], [], []
 
 
 @pytest.fixture
 def example(monkeypatch):
     """Names of the example."""
-    package, messages = ModuleType('moveit_msgs'), ModuleType('moveit_msgs.msg')
-    messages.CollisionObject = CollisionObject
-    monkeypatch.setitem(sys.modules, 'moveit_msgs', package)
+    messages = SimpleNamespace(CollisionObject=CollisionObject)
+    monkeypatch.setitem(sys.modules, 'moveit_msgs', SimpleNamespace(msg=messages))
     monkeypatch.setitem(sys.modules, 'moveit_msgs.msg', messages)
     return runpy.run_path(str(REPOSITORY / 'examples' / 'collision_objects.py'))
-
-
-@pytest.fixture(scope='module')
-def room():
-    """What is published of a floor 0.8 m below the camera and a wall 3 m ahead, and its planes."""
-    camera = kinect_camera(160, 120)
-    down = camera.rays[..., 1]
-    depth = np.minimum(0.8 / np.maximum(down, 1e-6), 3).astype(np.float32)
-    image = RangeImage.from_depth(depth, camera)
-    result = SequenceSegmenter(Config()).segment(image, 0)
-    header = Header(frame_id='optical')
-    messages = {
-        name: OUTPUTS[name].message(make_rclpy, header, image, result)
-        for name in ('planes', 'markers')
-    }
-    kind = message_class(OUTPUTS['markers'].kind)
-    messages['markers'] = deserialize_message(messages['markers'], kind)
-    return messages, result.planes
 
 
 class Scene(list):
@@ -82,10 +60,20 @@ def area(mesh):
     return np.linalg.norm(np.cross(second - first, third - first), axis=1).sum() / 2
 
 
-def test_hulls_become_meshes_and_go_with_their_planes(example, room):
-    messages, planes = room
-    scene = Scene()
-    example['CollisionObjects'].on_markers(scene, messages['markers'])
+def test_hulls_become_meshes_and_go_with_their_planes(example):
+    """Of a floor 0.8 m below the camera and a wall 3 m ahead."""
+    camera = kinect_camera(160, 120)
+    depth = np.minimum(0.8 / np.maximum(camera.rays[..., 1], 1e-6), 3).astype(np.float32)
+    image = RangeImage.from_depth(depth, camera)
+    result = SequenceSegmenter(Config()).segment(image, 0)
+    planes, markers = (
+        OUTPUTS[name].message(make_rclpy, Header(frame_id='optical'), image, result)
+        for name in ('planes', 'markers')
+    )
+    assert example['floor_of'](planes).coef == pytest.approx([0, -1, 0, 0.8], abs=1e-3)
+    markers = deserialize_message(markers, MarkerArray)
+    planes, scene = result.planes, Scene()
+    example['CollisionObjects'].on_markers(scene, markers)
     assert [(o.id, o.operation) for o in scene] == [(f'plane {p.id}', b'\x00') for p in planes]
     assert len(planes) == 2
     for item, plane in zip(scene, planes, strict=True):
@@ -93,12 +81,8 @@ def test_hulls_become_meshes_and_go_with_their_planes(example, room):
         # Outlines are simplified.
         assert area(item.meshes[0]) == pytest.approx(plane.area, rel=0.03)
     scene.clear()
-    names = [name for marker in messages['markers'].markers if (name := marker.ns)]
-    assert names.count('hulls') == 2
-    wall = make_rclpy(
-        'visualization_msgs/msg/MarkerArray',
-        markers=[m for m in messages['markers'].markers if m.id != planes[0].id],
-    )
+    assert [marker.ns for marker in markers.markers].count('hulls') == 2
+    wall = MarkerArray(markers=[m for m in markers.markers if m.id != planes[0].id])
     example['CollisionObjects'].on_markers(scene, wall)
     # What has not changed is not sent again.
     assert [(o.id, o.operation) for o in scene] == [(f'plane {planes[0].id}', b'\x01')]

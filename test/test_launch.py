@@ -3,8 +3,10 @@
 import os
 import runpy
 import sys
+from operator import itemgetter
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import pytest
 import yaml
@@ -43,48 +45,38 @@ def test_rviz_shows_topics_of_the_node_by_displays_of_their_types():
 def launched(monkeypatch):
     """Settings of the nodes that the launch file starts, by values of its arguments.
 
-    There is no wheel of launch: what the file uses of it only keeps its arguments here.
+    There is no wheel of launch: what the file uses of it is replaced.
     """
-
-    class Kept(SimpleNamespace):
-        def __init__(self, *arguments, **settings):
-            super().__init__(arguments=arguments, settings=settings)
-
-    class LaunchConfiguration(Kept):
-        def perform(self, context):
-            return context[self.arguments[0]]
-
-    def provide(name, *kept):
-        module = ModuleType(name)
-        vars(module).update({kind: type(kind, (Kept,), {}) for kind in kept})
+    launch, actions, substitutions, ros_actions = (MagicMock() for _ in range(4))
+    for name, module in {
+        'launch': launch,
+        'launch.actions': actions,
+        'launch.substitutions': substitutions,
+        'launch_ros': MagicMock(),
+        'launch_ros.actions': ros_actions,
+        'launch_ros.substitutions': MagicMock(),
+    }.items():
         monkeypatch.setitem(sys.modules, name, module)
-        return module
+    substitutions.LaunchConfiguration = lambda name: SimpleNamespace(perform=itemgetter(name))
+    runpy.run_path(os.fspath(LAUNCH_FILE))['generate_launch_description']()
+    declared = {c.args[0]: c.kwargs for c in actions.DeclareLaunchArgument.call_args_list}
+    ((described,), _) = launch.LaunchDescription.call_args
+    assert len(described) == len(declared) + 1  # the function that makes the nodes
 
-    provide('launch', 'LaunchDescription')
-    provide('launch.actions', 'DeclareLaunchArgument', 'OpaqueFunction')
-    substitutions = provide('launch.substitutions', 'EnvironmentVariable', 'PathJoinSubstitution')
-    substitutions.LaunchConfiguration = LaunchConfiguration
-    provide('launch_ros')
-    provide('launch_ros.actions', 'Node')
-    provide('launch_ros.substitutions', 'FindPackageShare')
-
-    def launch(**given):
-        (description,) = runpy.run_path(os.fspath(LAUNCH_FILE))[
-            'generate_launch_description'
-        ]().arguments
-        *declared, function = description
-        values = {d.arguments[0]: d.settings['default_value'] for d in declared}
+    def launched_with(**given):
+        values = {name: argument['default_value'] for name, argument in declared.items()}
         assert set(given) <= set(values)
-        assert all(d.settings['description'] for d in declared)
-        for declaration in declared:
-            name, choices = declaration.arguments[0], declaration.settings['choices']
-            assert choices is None or (values | given)[name] in choices
         values['params_file'] = os.fspath(ROOT / 'params/segment_planes.yaml')
         values['fastdds_profile'] = os.fspath(ROOT / 'params/fastdds_large_images.xml')
-        nodes = function.settings['function'](values | given)
-        return [node.settings for node in nodes]
+        values |= given
+        for name, argument in declared.items():
+            choices = argument['choices']
+            assert argument['description'] and (choices is None or values[name] in choices)
+        ros_actions.Node.reset_mock()
+        actions.OpaqueFunction.call_args.kwargs['function'](values)
+        return [call.kwargs for call in ros_actions.Node.call_args_list]
 
-    return launch
+    return launched_with
 
 
 def test_rviz_is_remapped_to_the_node_wherever_it_is(launched):

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -56,14 +57,10 @@ def provide(monkeypatch):
         monkeypatch.setenv(variable, f'{path}:{os.environ.get(variable, "")}'.rstrip(':'))
     monkeypatch.syspath_prepend(str(packages))
     # Loaded by name later, which finds what is loaded already.
-    left = sorted(libraries.glob('*.so'))
-    for _ in range(len(left)):
-        for library in list(left):
-            try:
-                ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
-                left.remove(library)
-            except OSError:
-                pass
+    built = sorted(libraries.glob('*.so'))
+    for library in built * len(built):  # again, as some need others
+        with suppress(OSError):
+            ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
     return ''
 
 
