@@ -15,7 +15,16 @@ ROS1 = get_typestore(Stores.ROS1_NOETIC)
 for tf in (TF, EARLY_TF):
     ROS1.register(get_types_from_msg('geometry_msgs/TransformStamped[] transforms', tf))
 ROS2 = get_typestore(Stores.ROS2_JAZZY)
+UNKNOWN = 'robot_msgs/msg/Secret'
+"""A type of messages that only its recordings define."""
+ROS2.register(get_types_from_msg('uint8 x', UNKNOWN))
 SUFFIXES = {'mcap': '', 'sqlite3': '', 'rosbag1': '.bag'}
+DEPTH, INFO = '/camera/depth/image_rect', '/camera/depth/camera_info'
+
+
+def stamp_of(number):
+    """Nanoseconds of an image, of 30 a second."""
+    return 10**18 + number * 33_333_333
 
 
 def depth_images(count, height=48, width=64):
@@ -38,79 +47,55 @@ class Recording:
         fields = {'seq': 0} if self.ros1 else {}
         return types['std_msgs/msg/Header'](stamp=time, frame_id=frame_id, **fields)
 
-    def add_image(self, stamp, image, encoding='16UC1', topic='/camera/depth/image_rect'):
+    def add_image(self, stamp, image, encoding='16UC1', topic=DEPTH):
         data = np.ascontiguousarray(image).view(np.uint8).ravel()
         layout = *image.shape[:2], encoding, 0, image.strides[0]
         message = self.store.types[IMAGE](self.header(stamp), *layout, data)
         self.messages.append((stamp, topic, IMAGE, message))
 
-    def add_compressed(self, stamp, image, topic='/camera/depth/image_rect/compressedDepth'):
+    def add_compressed(self, stamp, image):
         png = cv2.imencode('.png', image)[1].tobytes()
-        message = self.store.types[COMPRESSED](
-            header=self.header(stamp),
-            format='16UC1; compressedDepth png',
-            data=np.frombuffer(struct.pack('<iff', 0, 0, 0) + png, np.uint8),
-        )
-        self.messages.append((stamp, topic, COMPRESSED, message))
+        data = np.frombuffer(struct.pack('<iff', 0, 0, 0) + png, np.uint8)
+        format = '16UC1; compressedDepth png'
+        message = self.store.types[COMPRESSED](self.header(stamp), format, data)
+        self.messages.append((stamp, f'{DEPTH}/compressedDepth', COMPRESSED, message))
 
     def add_camera(
-        self,
-        stamp,
-        width=64,
-        height=48,
-        focal=50.0,
-        topic='/camera/depth/camera_info',
-        model='plumb_bob',
-        **changes,
+        self, stamp, width=64, height=48, focal=50.0, topic=INFO, model='plumb_bob', **changes
     ):
         k = changes.get('k', np.array([focal, 0, 31.5, 0, focal, 23.5, 0, 0, 1]))
         matrices = {'d': np.zeros(5), 'k': k, 'r': np.eye(3).ravel()}
         matrices |= {'p': np.insert(k, (3, 6, 9), 0.0), **changes}
         if self.ros1:
             matrices = {name.upper(): matrix for name, matrix in matrices.items()}
+        roi = self.store.types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False)
+        whole = {'binning_x': 0, 'binning_y': 0, 'roi': roi}
         message = self.store.types[CAMERA_INFO](
-            header=self.header(stamp),
-            height=height,
-            width=width,
-            distortion_model=model,
-            binning_x=0,
-            binning_y=0,
-            roi=self.store.types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False),
-            **matrices,
+            self.header(stamp), height, width, model, **matrices, **whole
         )
         self.messages.append((stamp, topic, CAMERA_INFO, message))
 
     def add_transform(self, stamp, parent, child, rotation, shift, kind=TF, static=False):
         """A transform of one moment, or for all; rotation x, y, z, w."""
         types = self.store.types
-        fields = dict(zip('xyzw', rotation, strict=True)), dict(zip('xyz', shift, strict=True))
         transform = types['geometry_msgs/msg/Transform'](
-            rotation=types['geometry_msgs/msg/Quaternion'](**fields[0]),
-            translation=types['geometry_msgs/msg/Vector3'](**fields[1]),
+            rotation=types['geometry_msgs/msg/Quaternion'](*rotation),
+            translation=types['geometry_msgs/msg/Vector3'](*shift),
         )
         stamped = types['geometry_msgs/msg/TransformStamped'](
-            header=self.header(stamp, parent), child_frame_id=child, transform=transform
+            self.header(stamp, parent), child, transform
         )
         message = types[kind](transforms=[stamped])
         self.messages.append((stamp, '/tf_static' if static else '/tf', kind, message))
 
-    def write(self, path, storage='mcap', compression=None):
-        """Write all messages; the file that holds them.
-
-        Compressed by BZ2 or LZ4 (ROS 1), or with zstd by FILE, MESSAGE or STORAGE (ROS 2).
-        """
+    def write(self, path, storage='mcap'):
+        """Write all messages; the file that holds them."""
         if self.ros1:
-            writer = rosbag1.Writer(path)
-            serialize = self.store.serialize_ros1
-            if compression:
-                writer.set_compression(writer.CompressionFormat[compression])
+            writer, serialize = rosbag1.Writer(path), self.store.serialize_ros1
         else:
             plugin = rosbag2.StoragePlugin[storage.upper()]
             writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
             serialize = self.store.serialize_cdr
-            if compression:
-                mode = rosbag2.CompressionMode[compression]
-                writer.set_compression(mode, rosbag2.CompressionFormat.ZSTD)
         with writer:
             connections = {}
             for stamp, topic, kind, message in self.messages:
@@ -127,8 +112,7 @@ def record(path, storage, images, compressed=False):
     """Record `images` with their camera at 30 Hz; the file that holds the messages."""
     recording = Recording(ros1=storage == 'rosbag1')
     for index, image in enumerate(images):
-        stamp = 10**18 + index * 33_333_333
-        recording.add_camera(stamp, image.shape[1], image.shape[0])
+        recording.add_camera(stamp_of(index), image.shape[1], image.shape[0])
         add = recording.add_compressed if compressed else recording.add_image
-        add(stamp, image)
+        add(stamp_of(index), image)
     return recording.write(path, storage)

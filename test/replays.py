@@ -1,7 +1,9 @@
 """Recordings of two walls, and what `rangeseg replay` makes of them."""
 
+import csv
+
 import numpy as np
-from recordings import ROS2, Recording
+from recordings import ROS2, UNKNOWN, Recording, stamp_of
 from rosbags import rosbag2
 
 from rangeseg_ros.batch.replay import Replay
@@ -19,15 +21,13 @@ def walls(count, height=48, width=64):
 
 
 def record_walls(path, count=4):
-    """Record walls with their camera and a topic of another kind."""
+    """Record walls with their camera and a topic of a type that nobody knows."""
     recording = Recording()
-    types = recording.store.types
     for index, image in enumerate(walls(count)):
-        stamp = 10**18 + index * 33_333_333
-        recording.add_camera(stamp)
-        recording.add_image(stamp, image)
-        text = types['std_msgs/msg/String'](f'frame {index}')
-        recording.messages.append((stamp, '/notes', 'std_msgs/msg/String', text))
+        recording.add_camera(stamp_of(index))
+        recording.add_image(stamp_of(index), image)
+        message = ROS2.types[UNKNOWN](index)
+        recording.messages.append((stamp_of(index), '/secret', UNKNOWN, message))
     recording.messages = [(time + DELAY, *rest) for time, *rest in recording.messages]
     recording.write(path)
     return path
@@ -40,6 +40,12 @@ def read(path):
             (time, c.topic, ROS2.deserialize_cdr(data, c.msgtype), bytes(data))
             for c, time, data in reader.messages()
         ]
+
+
+def rows_of(path):
+    """Rows of a table, by the names of its columns."""
+    with path.open(newline='') as file:
+        return list(csv.DictReader(file))
 
 
 def results(folder):
