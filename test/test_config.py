@@ -2,6 +2,7 @@
 
 from dataclasses import fields
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -31,10 +32,12 @@ def test_options_of_commands_are_as_their_parameters(command):
         assert tuple(getattr(option.type, 'choices', ())) == f.metadata['choices']
 
 
-def test_mapping_gives_what_the_constructor_gives():
-    assert Config.from_mapping({'smoothness': 10, 'exact': True}) == Config(
-        smoothness=10.0, exact=True
-    )
+def test_integers_and_numbers_of_numpy_are_taken():
+    mapping = {'smoothness': 10, 'noise': np.float32(0.5), 'min_pixels': np.int64(7)}
+    config = Config.from_mapping({**mapping, 'exact': np.bool_(True)})
+    assert config == Config(smoothness=10.0, noise=0.5, min_pixels=7, exact=True)
+    names = 'smoothness', 'noise', 'min_pixels', 'exact'
+    assert [type(getattr(config, name)) for name in names] == [float, float, int, bool]
 
 
 @pytest.mark.parametrize(
@@ -45,6 +48,7 @@ def test_mapping_gives_what_the_constructor_gives():
         ({'smoothness': float('nan')}, ['smoothness']),
         ({'smoothness': 'high'}, ['smoothness', 'float']),
         ({'min_pixels': 2.5}, ['min_pixels', 'int']),
+        ({'min_pixels': np.float64(7.0)}, ['min_pixels', 'type int']),
         ({'min_pixels': True}, ['min_pixels', 'int']),
         ({'exact': 1}, ['exact', 'bool']),
         ({'method': 'magic'}, ['method', 'planes', 'normals']),

@@ -34,11 +34,20 @@ def write_ply(path, points, binary=True, size=True):
     kind = 'binary_little_endian' if binary else 'ascii'
     head = ['ply', f'format {kind} 1.0', *info, f'element vertex {width * height}', *axes]
     head += ['property uchar red', 'element face 0', 'property list uchar int vertex_indices']
-    body = b''
-    for x, y, z in points.reshape(-1, 3):
-        row = np.array([x, y, z], '<f4').tobytes() + b'\x07'
-        body += row if binary else f'{x:.9g} {y:.9g} {z:.9g} 7\n'.encode()
+    rows = np.full(height * width, 7, [('points', '<f4', 3), ('red', 'u1')])
+    rows['points'] = points.reshape(-1, 3)
+    lines = (f'{x:.9g} {y:.9g} {z:.9g} {red}\n' for (x, y, z), red in rows)
+    body = rows.tobytes() if binary else ''.join(lines).encode()
     path.write_bytes('\n'.join([*head, 'end_header', '']).encode() + body)
+
+
+def write_exr(path, channels):
+    exr = pytest.importorskip('OpenEXR')
+    header = {'compression': exr.ZIP_COMPRESSION, 'type': exr.scanlineimage}
+    with exr.File(
+        header, {name: values.astype('f4') for name, values in channels.items()}
+    ) as file:
+        file.write(str(path))
 
 
 KINDS = ['png', 'pgm', 'float.pfm', 'tiff', 'float.tiff', 'npy', 'int64.npy', 'npz']
@@ -50,11 +59,7 @@ def test_images(kind, depth, tmp_path):
     path = tmp_path / f'frame.{kind}'
     metres = depth.astype(np.float32) / 1000
     if kind.endswith('exr'):
-        exr = pytest.importorskip('OpenEXR')
-        header = {'compression': exr.ZIP_COMPRESSION, 'type': exr.scanlineimage}
-        channels = {name: metres * (name != 'B.R') for name in kind[:-4].split(',')}
-        with exr.File(header, channels) as file:
-            file.write(str(path))
+        write_exr(path, {name: metres * (name != 'B.R') for name in kind[:-4].split(',')})
     elif kind == 'npz':
         np.savez_compressed(path, colour=np.zeros((48, 64, 3)), depth=metres)
     elif kind.endswith('npy'):
@@ -86,47 +91,40 @@ def test_organised_clouds(kind, depth, tmp_path):
 
 def test_what_is_none_is_refused_in_one_line(depth, tmp_path):
     points = RangeImage.from_depth(depth, CAMERA).points
-    write_ply(tmp_path / 'unsized.ply', points, size=False)
-    (tmp_path / 'cut.ply').write_bytes((tmp_path / 'unsized.ply').read_bytes()[:5000])
-    (tmp_path / 'text.ply').write_text('hello')
-    for name, field in (('list', 'list uchar int x'), ('kind', 'float99 x')):
-        head = f'ply\nformat ascii 1.0\nelement vertex 1\nproperty {field}\nend_header\n'
-        (tmp_path / f'{name}.ply').write_text(head)
-    (tmp_path / 'text.npy').write_text('hello')
-    (tmp_path / 'text.npz').write_text('hello')
-    (tmp_path / 'record.bag').write_text('hello')
-    np.savez(tmp_path / 'empty.npz')
-    np.save(tmp_path / 'text2.npy', np.array([['a']]))
-    np.save(tmp_path / 'row.npy', np.ones(5))
-    np.save(tmp_path / 'colour.npy', np.ones((4, 5, 3), np.uint8))
-    np.savez(tmp_path / 'first.npz', Depth=np.ones(5), colour=np.ones((4, 5)))
-    np.save(tmp_path / 'points.npy', np.ones((5, 3)))
-    for name, words in (
-        ('unsized.ply', 'each pixel of an organised cloud'),
-        ('cut.ply', 'truncated'),
-        ('text.ply', 'not a PLY file'),
-        ('list.ply', 'vertices with lists'),
-        ('kind.ply', 'vertices with lists'),
-        ('text.npy', 'not a readable file of NumPy'),
-        ('text.npz', 'not a readable file of NumPy'),
-        ('empty.npz', 'not a readable file of NumPy'),
-        ('record.bag', 'rangeseg replay'),
-        ('missing.ply', 'No such file'),
-        ('text2.npy', 'integers or floats, not <U1'),
-        ('colour.npy', r'points \(H, W, 3\), \(4, 5, 3\) uint8'),
-        ('first.npz', r'\(5,\) float64'),
-        ('row.npy', r'no depth \(H, W\) nor points'),
-        ('points.npy', '5 points, not one for each pixel'),
+    write_ply(tmp_path / 'cut.ply', points)
+    head = 'ply\nformat ascii 1.0\nelement vertex 1\nproperty {} x\nend_header\n'
+    for name, content, words in (
+        ('cut.ply', (tmp_path / 'cut.ply').read_bytes()[:5000], 'truncated'),
+        ('text.ply', b'hello end_header', 'not a PLY file'),
+        ('list.ply', head.format('list uchar int').encode(), 'vertices with lists'),
+        ('kind.ply', head.format('float99').encode(), 'vertices with lists'),
+        ('text.npy', b'hello', 'not a readable file of NumPy'),
+        ('text.npz', b'hello', 'not a readable file of NumPy'),
+        ('record.bag', b'hello', 'rangeseg replay'),
+        ('empty.npz', {}, 'not a readable file of NumPy'),
+        ('first.npz', {'Depth': np.ones(5), 'colour': np.ones((4, 5))}, r'\(5,\) float64'),
+        ('text2.npy', np.array([['a']]), 'integers or floats, not <U1'),
+        ('colour.npy', np.ones((4, 5, 3), np.uint8), r'points \(H, W, 3\), \(4, 5, 3\) uint8'),
+        ('row.npy', np.ones(5), r'no depth \(H, W\) nor points'),
+        ('points.npy', np.ones((5, 3)), '5 points, not one for each pixel'),
     ):
+        if isinstance(content, bytes):
+            (tmp_path / name).write_bytes(content)
+        elif isinstance(content, dict):
+            np.savez(tmp_path / name, **content)
+        else:
+            np.save(tmp_path / name, content)
         with pytest.raises(ValueError, match=words):
             read_frame(tmp_path / name, Intrinsics(fov=60))
+    write_ply(tmp_path / 'unsized.ply', points, size=False)
+    with pytest.raises(ValueError, match='each pixel of an organised cloud'):
+        read_frame(tmp_path / 'unsized.ply', Intrinsics(fov=60))
+    with pytest.raises(ValueError, match='No such file'):
+        read_frame(tmp_path / 'missing.ply', Intrinsics(fov=60))
 
 
 def test_a_picture_in_exr_is_no_depth(depth, tmp_path):
-    exr = pytest.importorskip('OpenEXR')
-    header = {'compression': exr.ZIP_COMPRESSION, 'type': exr.scanlineimage}
-    with exr.File(header, {name: depth * np.float32(k) for k, name in enumerate('RGB')}) as file:
-        file.write(str(tmp_path / 'colour.exr'))
+    write_exr(tmp_path / 'colour.exr', {name: k * depth for k, name in enumerate('RGB')})
     with pytest.raises(ValueError, match=r'which is depth\? Its channels: '):
         read_frame(tmp_path / 'colour.exr', Intrinsics(CAMERA))
 
@@ -213,27 +211,20 @@ VIEWPOINT 0 0 0 1 0 0 0
 POINTS 6
 DATA {}
 """
-X = np.array([[0.5, np.nan, 2], [3, 4, 5]], np.float32)
-LABEL = np.array([[0, 1, 65535], [3, 4, 5]], np.uint16)
-NORMAL = np.arange(18, dtype=float).reshape(2, 3, 3)
-
-
-def records():
-    dtype = np.dtype([('x', '<f4'), ('label', '<u2'), ('normal', '<f8', (3,))])
-    array = np.zeros((2, 3), dtype)
-    array['x'], array['label'], array['normal'] = X, LABEL, NORMAL
-    return array
+RECORDS = np.zeros((2, 3), [('x', '<f4'), ('label', '<u2'), ('normal', '<f8', (3,))])
+RECORDS['x'] = [[0.5, np.nan, 2], [3, 4, 5]]
+RECORDS['label'] = [[0, 1, 65535], [3, 4, 5]]
+RECORDS['normal'] = np.arange(18).reshape(2, 3, 3)
 
 
 def encoded(kind):
     head = HEADER.format(kind).encode()
-    array = records()
     if kind == 'ascii':
-        rows = (f'{r["x"]} {r["label"]} {" ".join(map(str, r["normal"]))}' for r in array.ravel())
+        rows = (f'{x} {label} {" ".join(map(str, normal))}' for x, label, normal in RECORDS.flat)
         return head + '\n'.join(rows).encode()
     if kind == 'binary':
-        return head + array.tobytes()
-    raw = b''.join(array[name].tobytes() for name in array.dtype.names)
+        return head + RECORDS.tobytes()
+    raw = b''.join(RECORDS[name].tobytes() for name in RECORDS.dtype.names)
     packed = literal_lzf(raw)
     return head + struct.pack('<II', len(packed), len(raw)) + packed
 
@@ -243,29 +234,32 @@ def test_encodings(tmp_path, kind):
     path = tmp_path / 'a.pcd'
     path.write_bytes(encoded(kind))
     values = read_pcd(path, 'label', 'x')
-    assert np.array_equal(values, np.stack([LABEL, X], axis=2), equal_nan=True)
+    np.testing.assert_array_equal(values, np.stack([RECORDS['label'], RECORDS['x']], axis=2))
     with pytest.raises(FileError, match='no field y, z in it'):
         read_pcd(path, *'xyz')
 
 
+BINARY = encoded('binary')
+
+
 @pytest.mark.parametrize(
-    ('change', 'fault'),
+    ('data', 'fault'),
     [
-        (lambda d: b'', 'not a readable'),
-        (lambda d: d.replace(b'FIELDS', b'FEELDS'), 'not a readable'),
-        (lambda d: d.replace(b'COUNT 1 1 3', b'COUNT 1 3'), 'not a readable'),
-        (lambda d: d.replace(b'SIZE 4 2 8', b'SIZE 4 3 8'), 'not a readable'),
-        (lambda d: d.replace(b'WIDTH 3', b'WIDTH 0'), '6 points where 0x2'),
-        (lambda d: d.replace(b'DATA binary', b'DATA zipped'), 'not a readable'),
-        (lambda d: d[:-1], 'not a readable'),
-        (lambda d: d.replace(b'WIDTH 3', b'WIDTH 10000000000'), '6 points where 1'),
-        (lambda d: encoded('ascii')[:-4], 'not a readable'),
-        (lambda d: encoded('binary_compressed')[:-5], 'not a readable'),
+        (b'', 'not a readable'),
+        (BINARY.replace(b'FIELDS', b'FEELDS'), 'not a readable'),
+        (BINARY.replace(b'COUNT 1 1 3', b'COUNT 1 3'), 'not a readable'),
+        (BINARY.replace(b'SIZE 4 2 8', b'SIZE 4 3 8'), 'not a readable'),
+        (BINARY.replace(b'DATA binary', b'DATA zipped'), 'not a readable'),
+        (BINARY.replace(b'WIDTH 3', b'WIDTH 0'), '6 points where 0x2'),
+        (BINARY.replace(b'WIDTH 3', b'WIDTH 10000000000'), '6 points where 1'),
+        (BINARY[:-1], 'not a readable'),
+        (encoded('ascii')[:-4], 'not a readable'),
+        (encoded('binary_compressed')[:-5], 'not a readable'),
     ],
 )
-def test_malformed(tmp_path, change, fault):
+def test_malformed(tmp_path, data, fault):
     path = tmp_path / 'bad.pcd'
-    path.write_bytes(change(encoded('binary')))
+    path.write_bytes(data)
     # The folder has the name of the test: words of it prove nothing.
     with pytest.raises(FileError, match=rf'^{path}: .*{fault}') as error:
         read_pcd(path, 'x')
