@@ -19,34 +19,30 @@ from rangeseg_ros.messages.images import depth_from_message
 from rangeseg_ros.messages.make import MessageError
 
 
-def camera_info(make=make_rosbags, roi=None, **changes):
+def camera_info(make=make_rosbags, **changes):
     camera = Camera(640, 480, 500.0, 510.0, 319.0, 239.0)
     message = camera_info_message(make, header(make), camera)
     for name, value in {'p': np.zeros(12), **changes}.items():
         setattr(message, name, value)
-    for name, value in (roi or {}).items():
-        setattr(message.roi, name, value)
     return message
 
 
 @pytest.mark.parametrize('make', [make_rosbags, needs_rclpy])
 def test_camera_honours_binning_and_region(make):
     make = make() if make is needs_rclpy else make
-    roi = {'x_offset': 100, 'y_offset': 40, 'height': 200, 'width': 400}
-    camera = camera_from_message(camera_info(make, binning_x=2, binning_y=2, roi=roi))
-    assert camera.shape == (100, 200)
-    assert (camera.fx, camera.fy) == (250, 255)
+    message = camera_info(make, binning_x=2, binning_y=2)
+    message.roi.x_offset, message.roi.y_offset = 100, 40
+    message.roi.width, message.roi.height = 400, 200
     # Column 319 of the full image is 219 of the region, between its columns 109 and 110.
-    assert (camera.cx, camera.cy) == ((219 + 0.5) / 2 - 0.5, (199 + 0.5) / 2 - 0.5)
+    centre = (219 + 0.5) / 2 - 0.5, (199 + 0.5) / 2 - 0.5
+    assert camera_from_message(message) == Camera(200, 100, 250, 255, *centre)
 
 
 def test_camera_is_the_same_object_while_nothing_changes():
     first = camera_from_message(camera_info())
     assert camera_from_message(camera_info()) is first
-    changed = camera_from_message(
-        camera_info(p=np.array([400.0, 0, 300, 0, 0, 400, 200] + [0] * 5))
-    )
-    assert (changed.fx, changed.fy) == (400, 400)
+    p = np.array([400.0, 0, 300, 0, 0, 400, 200] + [0] * 5)
+    assert camera_from_message(camera_info(p=p)) == Camera(640, 480, 400, 400, 300, 200)
 
 
 @pytest.mark.parametrize('order', '<>')
@@ -84,44 +80,32 @@ def test_damaged_cloud_is_refused_with_the_reason(changes, problem):
         points_from_message(message)
 
 
+LARGE = st.integers(0, 2**32 - 1)
+
+
 @given(
-    data=st.binary(max_size=200),
-    height=st.integers(0, 2**32 - 1),
-    width=st.integers(0, 2**32 - 1),
-    point_step=st.integers(0, 2**32 - 1),
-    row_step=st.integers(0, 2**32 - 1),
-    layout=st.lists(
-        st.tuples(
-            st.sampled_from(['x', 'y', 'z', '', 'w']),
-            st.integers(0, 2**32 - 1),
-            st.integers(0, 255),
-            st.integers(0, 2**32 - 1),
+    st.fixed_dictionaries(
+        {
+            **dict.fromkeys(('height', 'width', 'point_step', 'row_step'), LARGE),
+            'data': st.binary(max_size=200).map(lambda data: np.frombuffer(data, np.uint8)),
+        }
+    ),
+    st.lists(
+        st.fixed_dictionaries(
+            {
+                'name': st.sampled_from(['x', 'y', 'z', '', 'w']),
+                **dict.fromkeys(('offset', 'count'), LARGE),
+                'datatype': st.integers(0, 255),
+            }
         ),
         max_size=5,
     ),
 )
-def test_any_bytes_are_a_cloud_or_a_named_error(data, height, width, point_step, row_step, layout):
-    fields = [
-        make_rosbags(
-            'sensor_msgs/msg/PointField', name=name, offset=offset, datatype=kind, count=count
-        )
-        for name, offset, kind, count in layout
-    ]
-    message = make_rosbags(
-        'sensor_msgs/msg/PointCloud2',
-        header=header(),
-        height=height,
-        width=width,
-        fields=fields,
-        is_bigendian=False,
-        point_step=point_step,
-        row_step=row_step,
-        data=np.frombuffer(data, np.uint8),
-        is_dense=False,
-    )
+def test_any_bytes_are_a_cloud_or_a_named_error(changes, layout):
+    changes['fields'] = [make_rosbags('sensor_msgs/msg/PointField', **field) for field in layout]
     for read in (points_from_message, planes_from_message):
         with suppress(MessageError):
-            read(message)
+            read(cloud(np.ones((1, 1, 3)), **changes))
 
 
 def decode_image(*fields):
@@ -156,28 +140,12 @@ def test_image_errors_name_what_is_wrong():
         decode_image(1, 1, 'rgb8', False, 3, bytes(3))
     with pytest.raises(MessageError, match='empty'):
         decode_image(0, 1, '16UC1', False, 2, b'')
+    with pytest.raises(MessageError, match='empty'):
+        decode_image(1, 0, '16UC1', False, 2, b'')
     with pytest.raises(MessageError, match='rows of 3'):
         decode_image(1, 2, '16UC1', False, 3, bytes(9))
     with pytest.raises(MessageError, match='7 bytes'):
         decode_image(2, 2, '16UC1', False, 4, bytes(7))
-
-
-@given(
-    st.integers(0, 2**32 - 1) | st.integers(0, 5),
-    st.integers(0, 2**32 - 1) | st.integers(0, 5),
-    st.sampled_from(['16UC1', 'mono16', '32FC1', '8UC1', '']),
-    st.booleans(),
-    st.integers(0, 2**32 - 1) | st.integers(0, 24),
-    st.binary(max_size=120),
-)
-def test_any_image_fields_decode_or_raise_the_declared_error(
-    height, width, encoding, bigendian, step, data
-):
-    try:
-        depth = decode_image(height, width, encoding, bigendian, step, data)
-    except MessageError:
-        return
-    assert depth.shape == (height, width)
 
 
 def _compressed(image, a=0.0, b=0.0):
@@ -193,23 +161,16 @@ def test_compressed_millimetres(format):
     np.testing.assert_array_equal(decoded, depth)
 
 
-def test_compressed_metres_are_inverse_depth():
+@pytest.mark.parametrize(('a', 'b'), [(1000.0, -100.0), (1.0, 20.0)])
+def test_compressed_metres_are_inverse_depth(a, b):
     # compressed_depth_image_transport, codec.cpp: value = a / depth + b.
-    a, b = 1000.0, -100.0
-    value = np.array([[0, 1, 900], [400, 100, 65535]], np.uint16)
+    value = np.array([[0, 1, 10], [20, 30, 65535]], np.uint16)
     decoded = decode_compressed('32FC1; compressedDepth png', _compressed(value, a, b))
     assert decoded.dtype == np.float32
-    expected = a / (value.astype(float) - b)
-    expected[0, 0] = np.nan
+    with np.errstate(divide='ignore'):
+        expected = a / (value.astype(float) - b)
+    expected[(value == 0) | (expected < 0)] = np.nan  # invalid, or behind the camera
     np.testing.assert_allclose(decoded, expected, rtol=1e-6)
-
-
-def test_quantisation_without_a_depth_is_invalid():
-    value = np.array([[10, 20, 30]], np.uint16)
-    decoded = decode_compressed('32FC1; compressedDepth png', _compressed(value, 1.0, 20.0))
-    assert np.isnan(decoded[0, 0])  # behind the camera
-    assert not np.isfinite(decoded[0, 1])
-    assert decoded[0, 2] == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize(
@@ -230,29 +191,10 @@ def test_compressed_errors_name_what_is_wrong(format, data, message):
 
 def test_lengths_that_promise_more_than_can_follow_are_refused_before_memory_is_taken():
     good = _compressed(np.zeros((20, 20), np.uint16))
-    image, data = good.index(b'IHDR'), good.index(b'IDAT')
     lie = struct.pack('>I', 2**30)
-    for damaged in (
-        good[: image + 4] + lie + good[image + 8 :],
-        good[: data - 4] + lie + good[data:],
-    ):
+    for at in (good.index(b'IHDR') + 4, good.index(b'IDAT') - 4):
+        damaged = good[:at] + lie + good[at + 4 :]
         refused = pytest.raises(MessageError, match='no readable PNG')
         with mock.patch.object(cv2, 'imdecode') as decode, refused:
             decode_compressed('16UC1; compressedDepth png', damaged)
         assert not decode.called
-    # As dense as PNG gets: one value all over.
-    flat = np.full((2000, 2000), 1000, np.uint16)
-    decoded = decode_compressed('16UC1; compressedDepth png', _compressed(flat))
-    np.testing.assert_array_equal(decoded, flat)
-
-
-@given(st.binary(max_size=60), st.integers(0, 80))
-def test_any_compressed_bytes_decode_or_raise_the_declared_error(noise, cut):
-    good = _compressed(np.arange(20, dtype=np.uint16).reshape(4, 5))
-    for data in (noise, good[:cut], good[:cut] + noise + good[cut + len(noise) :]):
-        for format in ('16UC1; compressedDepth png', '32FC1; compressedDepth png'):
-            try:
-                depth = decode_compressed(format, data)
-            except MessageError:
-                continue
-            assert depth.ndim == 2

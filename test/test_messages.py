@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from message_classes import STORE, cdr, header, make_rosbags, needs_rclpy
 from planes_of_labels import stated_plane
@@ -35,6 +35,11 @@ from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 ARRAY = 'visualization_msgs/msg/MarkerArray'
 
 
+def places(points):
+    """Array (N, 3) of geometry_msgs/Point."""
+    return np.array([(point.x, point.y, point.z) for point in points]).reshape(-1, 3)
+
+
 def test_label_image_reads_back_as_it_was():
     labels = np.array([[0, 1, 2], [3, 256, 65535]], np.uint16)
     message = image_message(make_rosbags, header(), labels[:, ::-1], 'mono16')
@@ -43,17 +48,14 @@ def test_label_image_reads_back_as_it_was():
 
 
 @pytest.mark.parametrize(
-    ('model', 'd', 'said'),
-    [
-        ('', (), 'plumb_bob'),
-        ('equidistant', (0.1, 0.0, 0.0, 0.0), 'equidistant'),
-        ('rational_polynomial', (0.1,) * 8, 'rational_polynomial'),
-    ],
+    ('model', 'd'),
+    [('', ()), ('equidistant', (0.1, 0.0, 0.0, 0.0)), ('rational_polynomial', (0.1,) * 8)],
 )
-def test_a_camera_info_names_the_lens(model, d, said):
+def test_a_camera_info_names_the_lens(model, d):
     camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5, distortion_model=model, d=d)
     message = camera_info_message(make_rosbags, header(), camera)
-    assert message.distortion_model == said and tuple(message.d) == (d or (0.0,) * 5)
+    assert message.distortion_model == (model or 'plumb_bob')
+    assert tuple(message.d) == (d or (0.0,) * 5)
     assert camera_from_message(message) == camera
 
 
@@ -62,18 +64,14 @@ def test_planes_read_back_as_they_were():
     assert (message.height, message.width) == (1, 2)
     planes = planes_from_message(message)
     assert [ROLES[number] for number in planes['role']] == ['floor', 'wall']
-    covariance = {
-        f'covariance_{row}{column}': 4 * i + j
-        for i, row in enumerate('xyzd')
-        for j, column in enumerate('xyzd')
-        if i <= j
+    upper = {
+        f'covariance_{"xyzd"[i]}{"xyzd"[j]}': 4 * i + j for i in range(4) for j in range(i, 4)
     }
     for column, value in {
         **{'label': [1, 2], 'id': [101, 102], 'surface': [1, 2], 'count': [1000, 2000]},
         **{'x': [0.25, 0.5], 'normal_z': -1, 'distance': 2, 'length': 2, 'width': 1.5},
         **{'confidence': np.float32(0.9), 'probability': 0.75, 'centre_y': 0.25},
-        **{'orientation_x': 1, 'orientation_w': 0},
-        **covariance,
+        **{'orientation_x': 1, 'orientation_w': 0, **upper},
     }.items():
         np.testing.assert_array_equal(planes[column], np.broadcast_to(value, 2), column)
 
@@ -98,43 +96,25 @@ def test_node_and_replay_write_the_same_bytes(name, planes):
     assert cdr(live, output.kind) == offline
 
 
-@settings(deadline=None)
-@given(
-    st.lists(
-        st.tuples(
-            st.text(st.characters(exclude_characters='\0', codec='utf-8'), max_size=9),
-            st.integers(0, 7),
-            st.text(st.characters(exclude_characters='\0', codec='utf-8'), max_size=9),
-        ),
-        max_size=5,
-    )
-)
+TEXT = st.text(st.characters(exclude_characters='\0', codec='utf-8'), max_size=9)
+
+
+@given(st.lists(st.tuples(TEXT, st.integers(0, 7), TEXT), max_size=5))
 def test_bytes_of_markers_are_those_of_the_message(drawn):
     """However long texts and lists of points are, by which everything after them is aligned."""
-    drawn = [
-        Marker(
-            namespace,
-            count - 3,
-            LINE_STRIP,
-            (0.1, 0.2, 0.3),
-            (0.25, 0.5, 0.75, 1.0),
-            np.arange(3.0 * count).reshape(-1, 3),
-            text,
-            (1.0, 2.0, 3.0),
-        )
-        for namespace, count, text in drawn
-    ]
-    data = markers_bytes(header(), drawn)
+    scale, colour, position = (0.1, 0.2, 0.3), (0.25, 0.5, 0.75, 1.0), (1.0, 2.0, 3.0)
+    markers = []
+    for namespace, count, text in drawn:
+        points = np.arange(3.0 * count).reshape(-1, 3)
+        marker = Marker(namespace, count - 3, LINE_STRIP, scale, colour, points, text, position)
+        markers.append(marker)
+    data = markers_bytes(header(), markers)
     message = STORE.deserialize_cdr(data, ARRAY)
     assert bytes(STORE.serialize_cdr(message, ARRAY)) == data
-    for read, marker in zip(message.markers[1:], drawn, strict=True):
-        assert (read.ns, read.id, read.type, read.text) == (
-            marker.namespace,
-            marker.number,
-            LINE_STRIP,
-            marker.text,
-        )
-        assert [(p.x, p.y, p.z) for p in read.points] == list(map(tuple, marker.points))
+    for read, marker in zip(message.markers[1:], markers, strict=True):
+        told = read.ns, read.id, read.type, read.text
+        assert told == (marker.namespace, marker.number, LINE_STRIP, marker.text)
+        np.testing.assert_array_equal(places(read.points), marker.points)
         assert (read.pose.position.z, read.scale.y, read.color.b) == (3.0, 0.2, 0.75)
         turn = read.pose.orientation
         assert (turn.x, turn.y, turn.z, turn.w) == (0, 0, 0, 1) and not read.frame_locked
@@ -180,38 +160,34 @@ def test_stairs_and_the_outline_of_the_ground():
     np.testing.assert_array_equal(ring.points, np.eye(3)[[0, 1, 2, 0]])
 
 
-def message_of(planes):
-    """MarkerArray of planes."""
-    return STORE.deserialize_cdr(markers_bytes(header(), of_planes(planes)), ARRAY)
+def markers_of(planes):
+    """Markers of planes, those of a message."""
+    return STORE.deserialize_cdr(markers_bytes(header(), of_planes(planes)), ARRAY).markers
 
 
-def corners_of(marker):
-    """Triangles (M, 3, 3) of a TRIANGLE_LIST."""
-    return np.array([(p.x, p.y, p.z) for p in marker.points]).reshape(-1, 3, 3)
+def triangles_of(marker):
+    """Corners (M, 3, 3) of a TRIANGLE_LIST, and its normals (M, 3), twice as long as the areas."""
+    triangles = places(marker.points).reshape(-1, 3, 3)
+    return triangles, np.cross(*np.diff(triangles, axis=1).swapaxes(0, 1))
 
 
-def area_of(triangles):
-    first, second, third = np.moveaxis(triangles, 1, 0)
-    return np.linalg.norm(np.cross(second - first, third - first), axis=1).sum() / 2
+def area_of(normals):
+    return np.linalg.norm(normals, axis=1).sum() / 2
 
 
 def test_markers_start_anew_and_draw_hull_normal_and_id_of_every_plane():
-    message = message_of([stated_plane(1), stated_plane(2, hull=())])
-    clear, *drawn = message.markers
+    clear, *drawn = markers_of([stated_plane(1), stated_plane(2, hull=())])
     assert clear.action == clear.DELETEALL
     assert [(m.ns, m.id) for m in drawn] == [
         (namespace, number) for number in (101, 102) for namespace in ('hulls', 'normals', 'ids')
     ]
     hull, normal, number, no_hull = drawn[:4]
-    assert (hull.type, normal.type, number.type) == (
-        hull.TRIANGLE_LIST,
-        hull.ARROW,
-        hull.TEXT_VIEW_FACING,
-    )
-    assert area_of(corners_of(hull)) == pytest.approx(4.0)
+    kinds = clear.TRIANGLE_LIST, clear.ARROW, clear.TEXT_VIEW_FACING
+    assert (hull.type, normal.type, number.type) == kinds
+    assert area_of(triangles_of(hull)[1]) == pytest.approx(4.0)
     assert no_hull.points == []
-    start, tip = ((p.x, p.y, p.z) for p in normal.points)
-    np.testing.assert_allclose(np.subtract(tip, start), (0, 0, -ARROW_LENGTH), atol=1e-12)
+    ends = (0.25, 0.5, 2.0), (0.25, 0.5, 2.0 - ARROW_LENGTH)
+    np.testing.assert_allclose(places(normal.points), ends)
     assert number.text == '101 floor'
     assert {getattr(number.color, part) for part in 'rgba'} == {1.0}
     rgb = np.array([hull.color.r, hull.color.g, hull.color.b]) * 255
@@ -223,17 +199,14 @@ def test_concave_hull_with_a_hole_is_filled_and_no_more():
     outline = [(0, 0), (0, 3), (3, 3), (3, 0), (2, 0), (2, 2), (1, 2), (1, 0)]
     hole = [(0.25, 1), (0.75, 1), (0.75, 1.5), (0.25, 1.5)]
     rings = [[(x, y, 2.0) for x, y in ring] for ring in (outline, hole)]
-    message = message_of([stated_plane(1, rings[0], rings[1:])])
-    triangles = corners_of(message.markers[1])
-    assert area_of(triangles) == pytest.approx(9 - 2 - 0.25)
+    triangles, normals = triangles_of(markers_of([stated_plane(1, rings[0], rings[1:])])[1])
+    assert area_of(normals) == pytest.approx(9 - 2 - 0.25)
     np.testing.assert_allclose(triangles[..., 2], 2.0, atol=1e-12)
     # Counter-clockwise seen from the sensor, so that normals point towards it.
-    first, second, third = np.moveaxis(triangles, 1, 0)
-    assert (np.cross(second - first, third - first)[:, 2] < 0).all()
-    centres = triangles.mean(axis=1)
-    notch = (centres[:, 0] > 1) & (centres[:, 0] < 2) & (centres[:, 1] < 2)
-    inside = (abs(centres[:, 0] - 0.5) < 0.25) & (abs(centres[:, 1] - 1.25) < 0.25)
-    assert not (notch | inside).any()
+    assert (normals[:, 2] < 0).all()
+    x, y, _ = triangles.mean(axis=1).T
+    assert not ((x > 1) & (x < 2) & (y < 2)).any()
+    assert not ((abs(x - 0.5) < 0.25) & (abs(y - 1.25) < 0.25)).any()
 
 
 @pytest.mark.parametrize('axis', range(3))
@@ -245,13 +218,10 @@ def test_triangles_of_planes_of_any_direction_face_the_sensor(axis, sign):
     frame *= np.linalg.det([*frame, normal])
     hull = np.array([(0, 0), (2, 0), (1, 0.5), (2, 2), (0, 2)]) @ frame - 2 * normal
     found = replace(stated_plane(1, hull), normal=normal)
-    triangles = corners_of(message_of([found]).markers[1])
-    first, second, third = np.moveaxis(triangles, 1, 0)
-    doubled = np.cross(second - first, third - first) @ normal
+    doubled = triangles_of(markers_of([found])[1])[1] @ normal
     assert (doubled > 0).all() and doubled.sum() / 2 == pytest.approx(3)
 
 
 def test_a_hull_that_crosses_itself_still_makes_whole_triangles():
     bow_tie = [(0, 0, 2), (1, 1, 2), (0, 1, 2), (1, 0, 2), (2, 3, 2)]
-    hull = message_of([stated_plane(1, bow_tie)]).markers[1]
-    assert len(hull.points) % 3 == 0
+    assert len(markers_of([stated_plane(1, bow_tie)])[1].points) % 3 == 0
