@@ -1,84 +1,64 @@
 """Hoover's metrics: cases counted by hand, every tie rule, and a literal oracle."""
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rangeseg_ros.evaluation.hoover import RegionClass, classify
-from rangeseg_ros.evaluation.label_files import as_truth
 from rangeseg_ros.evaluation.overlap import ComparisonError, Overlap, overlap_figures
 from rangeseg_ros.evaluation.plane_errors import angle_errors, plane_errors
 
 
+def images(*runs):
+    """Two one-row images given as runs (truth label, found label, pixels)."""
+    truth, labels, counts = np.transpose(runs)
+    return np.repeat(truth, counts), np.repeat(labels, counts)
+
+
 def overlap(*runs):
-    """Overlap of two one-row images given as runs (truth label, found label, pixels)."""
-    truth = np.concatenate([np.full(n, g, np.uint16) for g, _, n in runs])
-    labels = np.concatenate([np.full(n, m, np.uint16) for _, m, n in runs])
-    return Overlap.between(truth[None], labels[None])
+    return Overlap.between(*images(*runs))
 
 
-def test_images_that_cannot_be_compared():
-    with pytest.raises(ComparisonError, match='size'):
-        Overlap.between(np.zeros((2, 2), int), np.zeros((2, 3), int))
+def test_labels_are_integers():
     with pytest.raises(ComparisonError, match='integers'):
         Overlap.between(np.zeros((2, 2)), np.zeros((2, 2), int))
 
 
+def share(region, other):
+    """Part of the pixels of a region that are in another one."""
+    return other[region].mean()
+
+
 def literal(truth, labels, tolerance):
-    """The five metrics as the reference tool is described, pixel by pixel and in its order."""
-    gts = sorted({int(v) for v in truth.flat} - {0})
-    mss = sorted({int(v) for v in labels.flat} - {0})
-
-    def size(image, k):
-        return sum(int(v) == k for v in image.flat)
-
-    def both(n, m):
-        return sum(
-            int(a) == n and int(b) == m for a, b in zip(truth.flat, labels.flat, strict=True)
-        )
-
-    gt_class = dict.fromkeys(gts)
-    ms_class = dict.fromkeys(mss)
-    for n in gts:
-        for m in mss:
-            m1, m2 = both(n, m) / size(truth, n), both(n, m) / size(labels, m)
-            if m1 >= tolerance and m2 >= tolerance:
-                gt_class[n] = ms_class[m] = ('correct', m1, m2)
-    for n in gts:
-        parts = [m for m in mss if both(n, m) / size(labels, m) >= tolerance]
-        if len(parts) < 2:
-            continue
-        covered = sum(both(n, m) for m in parts)
-        m1, m2 = covered / size(truth, n), covered / sum(size(labels, m) for m in parts)
-        if m1 >= tolerance and m2 >= tolerance:
-            if gt_class[n] and (gt_class[n][1] + gt_class[n][2]) / 2 >= (m1 + m2) / 2:
-                continue
-            gt_class[n] = ('over', m1, m2)
-            ms_class.update(dict.fromkeys(parts, ('over', m1, m2)))
-    for m in mss:
-        parts = [n for n in gts if both(n, m) / size(truth, n) >= tolerance]
-        if len(parts) < 2:
-            continue
-        covered = sum(both(n, m) for n in parts)
-        m1, m2 = covered / sum(size(truth, n) for n in parts), covered / size(labels, m)
-        if m1 >= tolerance and m2 >= tolerance:
-            if ms_class[m] and not (m1 + m2) / 2 > (ms_class[m][1] + ms_class[m][2]) / 2:
-                continue
-            ms_class[m] = ('under', m1, m2)
-            gt_class.update(dict.fromkeys(parts, ('under', m1, m2)))
-    return (
-        [c[0] if c else None for c in gt_class.values()],
-        [c[0] if c else None for c in ms_class.values()],
+    """Classes as the reference tool is described, region by region and in its order."""
+    of_truth, of_labels = (
+        dict.fromkeys(np.unique(image[image > 0]), (RegionClass.UNMATCHED, 0))
+        for image in (truth, labels)
     )
+    for n, m in itertools.product(of_truth, of_labels):
+        shares = share(truth == n, labels == m), share(labels == m, truth == n)
+        if min(shares) >= tolerance:
+            of_truth[n] = of_labels[m] = RegionClass.CORRECT, np.mean(shares)
+
+    def split(kind, whole, of_whole, other, of_other):
+        for n, (_, before) in of_whole.items():
+            parts = [m for m in of_other if share(other == m, whole == n) >= tolerance]
+            if len(parts) < 2:
+                continue
+            together = np.isin(other, parts)
+            shares = share(whole == n, together), share(together, whole == n)
+            if min(shares) >= tolerance and np.mean(shares) > before:
+                of_whole[n] = kind, np.mean(shares)
+                of_other.update(dict.fromkeys(parts, of_whole[n]))
+
+    split(RegionClass.OVER, truth, of_truth, labels, of_labels)
+    split(RegionClass.UNDER, labels, of_labels, truth, of_truth)
+    return [[kind for kind, _ in classes.values()] for classes in (of_truth, of_labels)]
 
 
-NAMES = {
-    RegionClass.UNMATCHED: None,
-    RegionClass.CORRECT: 'correct',
-    RegionClass.OVER: 'over',
-    RegionClass.UNDER: 'under',
-}
 RUNS = st.lists(
     st.tuples(st.integers(0, 3), st.integers(0, 3), st.integers(1, 30)), min_size=1, max_size=9
 )
@@ -86,21 +66,15 @@ RUNS = st.lists(
 
 @given(RUNS, st.sampled_from([0.51, 0.6, 0.75, 0.8, 0.9, 1.0]))
 @example([(1, 1, 45), (1, 2, 3), (0, 2, 2), (1, 0, 27)], 0.6)
-@example([(1, 1, 80), (1, 2, 2), (1, 0, 20), (2, 1, 10)], 0.75)
 @example([(1, 1, 80), (1, 2, 15), (1, 0, 5), (2, 1, 10)], 0.8)
 @example([(1, 1, 45), (2, 1, 3), (2, 0, 2), (0, 1, 27)], 0.6)
 @example([(1, 1, 4), (2, 1, 3), (0, 1, 3)], 0.75)
-@example([(1, 1, 4), (1, 2, 3), (1, 0, 3)], 0.75)
-@example([(1, 1, 6), (1, 2, 3), (0, 2, 3)], 0.6)
 @example([(1, 1, 3), (0, 1, 1), (1, 2, 3), (0, 2, 1)], 0.75)
 @example([(1, 1, 3), (1, 2, 3), (1, 0, 2)], 0.75)
-@example([(1, 1, 3), (2, 1, 3), (0, 1, 2)], 0.75)
-@example([(1, 1, 3), (1, 0, 1), (2, 1, 3), (2, 0, 1)], 0.75)
 def test_classes_are_those_of_the_literal_counting(runs, tolerance):
-    truth = np.concatenate([np.full(n, g) for g, _, n in runs])
-    labels = np.concatenate([np.full(n, m) for _, m, n in runs])
+    truth, labels = images(*runs)
     result = classify(Overlap.between(truth, labels), tolerance)
-    found = ([NAMES[c] for c in result.truth], [NAMES[c] for c in result.labels])
+    found = [result.truth.tolist(), result.labels.tolist()]
     assert found == literal(truth, labels, tolerance)
 
 
@@ -153,13 +127,3 @@ def test_plane_errors():
     errors = plane_errors(truth, found, {1: 7, 2: 8, 3: 9, 4: 7})
     assert errors == pytest.approx(np.array([[3.0, 0.01], [0.0, 0.5]]))
     assert plane_errors(truth, found, {}).shape == (0, 2)
-
-
-def test_what_is_not_judged_does_not_count():
-    """0 means so where a truth says elsewhere what is judged not to be planar."""
-    labels = np.zeros((4, 6), np.uint16)
-    labels[:, :3], labels[:, 5] = 1, 65535
-    truth = as_truth(labels, 1)
-    np.testing.assert_array_equal(truth.judged, labels > 0)
-    np.testing.assert_array_equal(truth.labels, labels == 1)
-    assert as_truth(labels[:, :5], 1).judged is None
