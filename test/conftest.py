@@ -32,9 +32,6 @@ settings.register_profile('nightly', deadline=None, max_examples=500, print_blob
 settings.load_profile('rangeseg')
 
 
-COMPILES = 'rangeseg_ros: compiling kernels, once after the installation'
-
-
 @pytest.fixture
 def run(monkeypatch, capsys):
     """Run the command: the exit code, standard output and error."""
@@ -45,7 +42,8 @@ def run(monkeypatch, capsys):
             main()
         output, error = capsys.readouterr()
         # Which test is the first to need kernels is told by their order.
-        return done.value.code or 0, output, error.replace(f'{COMPILES}\n', '')
+        compiles = 'rangeseg_ros: compiling kernels, once after the installation\n'
+        return done.value.code or 0, output, error.replace(compiles, '')
 
     return run_command
 

@@ -21,6 +21,7 @@ from matplotlib import pyplot
 import rangeseg_ros
 from rangeseg_ros import RangeImage
 from rangeseg_ros.cli.main import rangeseg
+from rangeseg_ros.io.images import write_image
 from rangeseg_ros.io.tables import columns
 from rangeseg_ros.messages.outputs import MAP_OUTPUTS, OUTPUTS
 from rangeseg_ros.simulation.render import simulate
@@ -129,14 +130,12 @@ def test_recipes_for_data_run(tmp_path, monkeypatch, seen):
     matrix = [525, 0, 0, 0, 525, 0, 319.5, 239.5, 1]
     intrinsics = {'width': 640, 'height': 480, 'intrinsic_matrix': matrix}
     Path('intrinsics.json').write_text(json.dumps(intrinsics))
-    cv2.imwrite('frame.png', seen.depth)
     tum, scenes = Path('rgbd_dataset_freiburg1_desk'), Path('seq-01')
-    for folder in (tum / 'depth', tum / 'rgb', scenes):
-        folder.mkdir(parents=True)
-    cv2.imwrite(str(tum / 'depth/1305031453.374112.png'), 5 * seen.depth)
-    cv2.imwrite(str(tum / 'rgb/1305031453.374112.png'), np.zeros((480, 640, 3), np.uint8))
+    write_image(Path('frame.png'), seen.depth)
+    write_image(scenes / 'frame-000000.depth.png', seen.depth)
+    write_image(tum / 'depth/1305031453.374112.png', 5 * seen.depth)
+    write_image(tum / 'rgb/1305031453.374112.png', np.zeros((480, 640, 3), np.uint8))
     (tum / 'depth.txt').write_text('# depth\n1305031453.374112 depth/1305031453.374112.png\n')
-    cv2.imwrite(str(scenes / 'frame-000000.depth.png'), seen.depth)
     run(['pack', str(scenes), '--camera', 'camera.yaml', '--output', 'recording.bag'])
     for number, words in enumerate(shown_commands('docs/your-data.md')):
         if '0.0002' in words:
@@ -226,12 +225,11 @@ def constants():
     for path in core.rglob('*.py'):
         name = path.relative_to(core).with_suffix('').as_posix()
         module = importlib.import_module(f'rangeseg_ros.core.{name.replace("/", ".")}')
-        text = path.read_text()
-        lines, statements = text.splitlines(), ast.parse(text).body
-        for statement, after in zip(statements, [*statements[1:], None], strict=True):
+        lines, statements = path.read_text().splitlines(), ast.parse(path.read_text()).body
+        for statement, after in itertools.pairwise([*statements, None]):
             if not isinstance(statement, ast.Assign):
                 continue
-            above = list(itertools.takewhile(str.strip, reversed(lines[: statement.lineno - 1])))
+            above = itertools.takewhile(str.strip, reversed(lines[: statement.lineno - 1]))
             commented = (
                 any(line.startswith('#') for line in above)
                 or '#' in lines[statement.lineno - 1]
