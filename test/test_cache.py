@@ -119,7 +119,7 @@ def test_folders_that_the_user_names_come_first_but_where_others_can_write(
 
 @pytest.mark.parametrize(
     ('mode', 'group', 'private'),
-    [(0o770, 0, True), (0o770, 1, False), (0o755, 1, True), (0o702, 0, False)],
+    [(0o770, 0, True), (0o770, 1, False), (0o755, 1, True), (0o702, 0, False), (0o1777, 0, False)],
 )
 def test_a_group_with_the_number_of_its_user_is_the_user(monkeypatch, mode, group, private):
     user = os.getuid()

@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from click.testing import CliRunner
 from matplotlib import pyplot
 
 import rangeseg_ros
@@ -95,14 +94,8 @@ def shown_commands(page):
     return [shlex.split(line, comments=True) for line in lines]
 
 
-def run(words):
-    done = CliRunner().invoke(rangeseg, words)
-    assert done.exit_code == 0, (words, done.output)
-    return done.output
-
-
 @pytest.mark.slow
-def test_the_tutorial_can_be_followed(tmp_path, monkeypatch):
+def test_the_tutorial_can_be_followed(tmp_path, monkeypatch, run):
     pyplot.switch_backend('agg')
     monkeypatch.chdir(tmp_path)
     text = (ROOT / 'docs/tutorial.md').read_text()
@@ -110,7 +103,7 @@ def test_the_tutorial_can_be_followed(tmp_path, monkeypatch):
         '\n'.join(re.findall(r'^    (.*(?:segment_planes:|up_.*))$', text, re.M))
     )
     for words in shown_commands('docs/tutorial.md'):
-        run(words)
+        assert run(*words)[0] == 0, words
     (code,) = re.findall(r'```python\n(.*?)```', text, re.S)
     known = {}
     exec(code, known)
@@ -121,7 +114,7 @@ def test_the_tutorial_can_be_followed(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_recipes_for_data_run(tmp_path, monkeypatch, seen):
+def test_recipes_for_data_run(tmp_path, monkeypatch, run, seen):
     """Each command of docs/your-data.md, on files of the kind it is for."""
     monkeypatch.chdir(tmp_path)
     text = (ROOT / 'docs/your-data.md').read_text()
@@ -136,11 +129,12 @@ def test_recipes_for_data_run(tmp_path, monkeypatch, seen):
     write_image(tum / 'depth/1305031453.374112.png', 5 * seen.depth)
     write_image(tum / 'rgb/1305031453.374112.png', np.zeros((480, 640, 3), np.uint8))
     (tum / 'depth.txt').write_text('# depth\n1305031453.374112 depth/1305031453.374112.png\n')
-    run(['pack', str(scenes), '--camera', 'camera.yaml', '--output', 'recording.bag'])
+    packed = run('pack', scenes, '--camera', 'camera.yaml', '--output', 'recording.bag')
+    assert packed[0] == 0
     for number, words in enumerate(shown_commands('docs/your-data.md')):
         if '0.0002' in words:
             words[1] = str(tum / 'depth/1305031453.374112.png')
-        run([*words, '--output', str(number)])  # the last one counts
+        assert run(*words, '--output', number)[0] == 0, words  # the last output counts
         (labels,) = Path(str(number)).rglob('*_labels.png')
         assert cv2.imread(str(labels), cv2.IMREAD_UNCHANGED).max() > 5
 
