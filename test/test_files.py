@@ -255,7 +255,7 @@ def test_errors_are_one_line_of_printable_characters():
 
 
 def test_figures_are_json_as_they_are_and_nan_is_null(tmp_path):
-    figures = {'a': 0.25, 'b': {'c': float('nan'), 'd': 3}, 'e': [1.5, 'x'], 'f': None}
+    figures = {'a': 0.25, 'b': {'c': np.nan, 'd': 3}, 'e': [np.inf, 'x', np.nan], 'f': None}
     write_json(tmp_path / 'a.json', figures)
     told = json.loads((tmp_path / 'a.json').read_text())
-    assert told == {'a': 0.25, 'b': {'c': None, 'd': 3}, 'e': [1.5, 'x'], 'f': None}
+    assert told == {'a': 0.25, 'b': {'c': None, 'd': 3}, 'e': [None, 'x', None], 'f': None}

@@ -199,16 +199,11 @@ json_file: Decorator = click.option(
 
 
 def write_json(path: Path | None, figures: Mapping[str, Any]) -> None:
-    """Write figures as JSON where there is a file for them, NaN as null."""
+    """Write figures as JSON where there is a file for them, NaN and infinity as null."""
     if path:
         with replacing(path) as partial:
-            partial.write_text(json.dumps(_as_json(figures), indent=2) + '\n')
-
-
-def _as_json(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _as_json(item) for key, item in value.items()}
-    return None if isinstance(value, float) and math.isnan(value) else value
+            known = json.loads(json.dumps(figures), parse_constant=lambda _: None)
+            partial.write_text(json.dumps(known, indent=2) + '\n')
 
 
 def check_replaceable(path: Path, beginning: bytes) -> None:
