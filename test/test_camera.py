@@ -25,16 +25,6 @@ P = [[450, 0, 310, 0], [0, 460, 235, 0], [0, 0, 1, 0]]
 WHOLE = {'image_width': 640, 'image_height': 480, 'camera_matrix': {'data': np.ravel(K).tolist()}}
 
 
-def test_rays_project_back_to_their_pixels():
-    camera = Camera(7, 5, 500.0, 510.0, 3.2, 1.9)
-    assert camera.shape == (5, 7) and camera.rays.dtype == np.float32
-    columns = camera.rays[..., 0] * 500 + 3.2
-    rows = camera.rays[..., 1] * 510 + 1.9
-    np.testing.assert_allclose(columns, np.tile(np.arange(7), (5, 1)), atol=1e-4)
-    np.testing.assert_allclose(rows, np.tile(np.arange(5)[:, None], 7), atol=1e-4)
-    assert (camera.rays[..., 2] == 1).all()
-
-
 def test_pickles_leave_the_rays_behind():
     camera = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
     rays = camera.rays
@@ -55,20 +45,15 @@ def test_numbers_of_numpy_are_numbers():
 
 
 def test_projection_matrix_wins_when_rectified():
-    rectified = Camera(640, 480, 450, 460, 310, 235)
-    assert camera_from_matrices(640, 480, K, P) == rectified
-    assert camera_from_calibration({**WHOLE, 'projection_matrix': {'data': P}}) == rectified
-    assert camera_from_matrices(640, 480, K).fx == 500
-    assert camera_from_matrices(640, 480, K, np.zeros(12)).fx == 500
+    rectified = camera_from_calibration({**WHOLE, 'projection_matrix': {'data': P}})
+    assert rectified == Camera(640, 480, 450, 460, 310, 235)
     for calibration in (WHOLE, {**WHOLE, 'projection_matrix': None}):
         assert camera_from_calibration(calibration).fx == 500
 
 
 def test_binning_keeps_the_rays_of_the_collected_pixels():
-    full, binned = (
-        camera_from_matrices(640, 480, K),
-        camera_from_matrices(640, 480, K, None, (2, 4)),
-    )
+    full = camera_from_matrices(640, 480, K)
+    binned = camera_from_matrices(640, 480, K, None, (2, 4))
     assert binned.shape == (120, 320)
     block = full.rays[4:8, 6:8].reshape(-1, 3).mean(axis=0)
     np.testing.assert_allclose(binned.rays[1, 3], block, atol=1e-6)
@@ -90,10 +75,8 @@ def test_region_of_interest_moves_the_principal_point():
         ({'fx': np.nan}, 'fx'),
         ({'cy': np.inf}, 'cy'),
         ({'width': 640.7}, 'width must be a positive whole number'),
-        ({'width': '64'}, 'width'),
         ({'height': True}, 'height'),
         ({'width': 10**400}, 'width'),
-        ({'width': np.inf}, 'width'),
         ({'fx': 10**400}, 'fx'),
         ({'fx': '500'}, 'fx'),
         ({'fx': 1e-300}, 'do not fit 4x3 pixels'),
@@ -115,8 +98,6 @@ def test_impossible_intrinsics(change, message):
         ({'image_width': 4, 'image_height': 3, 'camera_matrix': {'data': [1, 2]}}, '9 values'),
         ({'image_width': 4, 'image_height': 3, 'camera_matrix': 5}, 'malformed'),
         ({**WHOLE, 'image_width': 640.7}, 'width'),
-        ({**WHOLE, 'image_width': True}, 'width'),
-        ({**WHOLE, 'image_width': np.inf}, 'width'),
         ({**WHOLE, 'projection_matrix': 5}, 'malformed'),
         ({**WHOLE, 'projection_matrix': {}}, 'data'),
         ({**WHOLE, 'projection_matrix': {'data': ['a'] * 12}}, 'must be numbers'),
@@ -133,36 +114,25 @@ def test_malformed_calibrations(calibration, message):
         camera_from_calibration(calibration)
 
 
-RADII = np.linspace(0, 0.8, 81)
-
-
 def lens(model, *d, **changes):
     return Camera(320, 240, 300, 310, 159.5, 119.5, distortion_model=model, d=d, **changes)
 
 
-def undistorted_radius(model, *d):
-    """Radii of the points that appear at RADII, for lenses of radial distortion alone."""
-    direction = np.array([0.6, 0.8])
-    x, y = undistort(RADII * direction[0], RADII * direction[1], model, d)
-    known = ~np.isnan(x)
-    np.testing.assert_allclose(x[known] * direction[1], y[known] * direction[0], atol=1e-12)
-    return np.where(known, np.hypot(x, y), np.nan)
-
-
 @pytest.mark.parametrize('k1', [-0.1, -0.3])
 def test_barrel_of_one_coefficient_ends_where_it_turns_back(k1):
-    scale = np.sqrt(-3 * k1)
+    radii, scale = np.linspace(0, 0.8, 81), np.sqrt(-3 * k1)
+    radii = radii[np.abs(radii - 2 / 3 / scale) > 0.02]  # where they do not touch the turn
     with np.errstate(invalid='ignore'):
-        expected = 2 / scale * np.sin(np.arcsin(1.5 * RADII * scale) / 3)
-    found = undistorted_radius('plumb_bob', k1, 0, 0, 0, 0)
-    clear = np.abs(RADII - 2 / 3 / scale) > 0.02  # where it does not touch the turn
-    np.testing.assert_allclose(found[clear], expected[clear], 1e-9)
-    assert np.isnan(found).any() == (k1 == -0.3)
+        expected = 2 / scale * np.sin(np.arcsin(1.5 * radii * scale) / 3)
+    found = undistort(0.6 * radii, 0.8 * radii, 'plumb_bob', (k1, 0, 0, 0, 0))
+    np.testing.assert_allclose(found, [0.6 * expected, 0.8 * expected], 1e-9)
+    assert np.isnan(expected).any() == (k1 == -0.3)
 
 
 @pytest.mark.parametrize(
     ('model', 'd'),
     [
+        ('', ()),
         ('plumb_bob', (-0.28, 0.07, 0.002, -0.001, -0.01)),
         ('rational_polynomial', (0.5, -2.6, 0.0006, -0.0002, 1.5, 0.4, -2.4, 1.4)),
         (
@@ -175,16 +145,15 @@ def test_barrel_of_one_coefficient_ends_where_it_turns_back(k1):
 def test_opencv_sees_the_rays_at_their_pixels(model, d):
     camera = lens(model, *d, skew=3.0)
     rays = camera.rays.reshape(-1, 3).astype(np.float64)
-    assert (rays[:, 2] == 1).all()
+    assert (rays[:, 2] == 1).all() and camera.rays.dtype == np.float32
     if model == 'equidistant':
         points = cv2.fisheye.distortPoints(rays[None, :, :2], np.eye(3), np.array(d))[0]
     else:
         zero = np.zeros(3)
         points = cv2.projectPoints(rays, zero, zero, np.eye(3), np.array(d))[0][:, 0]
     columns, rows = camera.matrix[:2] @ np.column_stack([points, np.ones(len(points))]).T
-    v, u = np.indices(camera.shape)
-    np.testing.assert_allclose(columns, u.ravel(), atol=2e-4)
-    np.testing.assert_allclose(rows, v.ravel(), atol=2e-4)
+    expected = np.indices((240, 320)).reshape(2, -1)
+    np.testing.assert_allclose([rows, columns], expected, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -223,18 +192,6 @@ def test_planes_behind_a_lens(model, method):
     offsets = (points - plane.centre) @ Rotation.from_quat(plane.orientation).as_matrix()
     np.testing.assert_allclose(np.ptp(offsets[:, :2], axis=0), plane.extents, atol=0.06)
     assert (plane.extents > np.ptp(offsets[:, :2], axis=0)).all()
-    # A pinhole of the same matrix bends it: parts of it are planes at best, each off by more.
-    bent = RangeImage.from_depth(depth, lens(''))
-    planes = Segmenter(Config(method=method)).segment(bent).planes
-    assert all(bent_plane.normal @ normal < 1 - 1e-6 for bent_plane in planes)
-    assert len(planes) != 1 or planes[0].normal @ normal < 1 - 1e-4
-
-
-def test_pixels_without_a_ray_are_not_measured():
-    camera = lens('plumb_bob', -1.0, 0, 0, 0)
-    image = RangeImage.from_depth(np.full(camera.shape, 1000, np.uint16), camera)
-    assert image.valid[120, 160] and not image.valid[0, 0]
-    assert np.isfinite(camera.rays).all()
 
 
 def test_what_is_rectified_and_what_is_raw():
@@ -300,7 +257,10 @@ def test_coefficients_that_no_lens_has_are_refused(model, value):
 def test_a_lens_that_folds_the_image_is_told():
     with pytest.warns(CameraWarning, match=r'folds the image: .*% of it is left out'):
         folded = lens('plumb_bob', -0.8, 0.0, 0.0, 0.0)
-    assert not folded.rays.any(axis=2).all()
+    assert np.isfinite(folded.rays).all()
+    image = RangeImage.from_depth(np.full(folded.shape, 1000, np.uint16), folded)
+    assert image.valid[120, 160] and not image.valid[0, 0]
+    np.testing.assert_array_equal(image.valid, folded.rays.any(axis=2))
     with warnings.catch_warnings():
         warnings.simplefilter('error')
         lens('plumb_bob', -0.2, 0.0, 0.0, 0.0)
