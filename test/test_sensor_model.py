@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.fitting.error_law import Law, Strata, fit_law
@@ -64,10 +65,9 @@ def test_quantisation_shows_beside_steps_of_several_quanta():
     assert found == (pytest.approx(1e-3, rel=1e-3), 0)
 
 
-@pytest.mark.parametrize('step', [0.01, 0.02])
+@pytest.mark.parametrize('step', [0.005, 0.01, 0.02])
 def test_errors_of_what_is_only_rounded_are_those_of_rounding(step):
-    depth = np.rint(1 / three_planes() / step) * step
-    sensor = sensor_of(1 / depth)
+    sensor = sensor_of(1 / (step * np.rint(1 / three_planes() / step)))
     assert sensor.range_quantum == pytest.approx(step, rel=1e-3) and sensor.quantum == 0
     errors = sensor.range_noise, sensor.range_distortion
     assert errors == pytest.approx((step / 12**0.5,) * 2, rel=0.01)
@@ -182,16 +182,6 @@ def test_clutter_and_outliers_change_little(seed):
     assert sensor_of(inverse).noise == pytest.approx(0.002, rel=0.15)
 
 
-@pytest.mark.parametrize('width', [1.0, 2.0, 4.0])
-def test_correlated_noise_is_told_with_its_length(width):
-    random = np.random.default_rng(4)
-    field = smooth_field(CAMERA.shape, (width, width), random)
-    sensor = sensor_of(three_planes() + 0.002 * field)
-    assert sensor.noise == pytest.approx(0.002, rel=0.2)
-    # Every second pixel does not tell how much is white: the pixels that agree count.
-    assert 0.5 < sensor.correlated / (4 * np.pi * width**2) < 2
-
-
 @pytest.mark.parametrize('bend', [0.002, 0.006])
 def test_the_stronger_planes_bend_the_more_distortion_is_measured(bend):
     """Not its overall size, but what it moves parts of planes by, to within half."""
@@ -214,11 +204,7 @@ def test_what_noise_hides_is_not_made_more_of(seed):
     assert sensor.distortion < 1.5 * (creases / depth**2).std()
 
 
-def test_depth_and_disparity_rounded_to_steps_tell_the_step():
-    for step in (0.005, 0.02):
-        sensor = sensor_of(1 / (step * np.rint(1 / three_planes() / step)))
-        assert sensor.range_quantum == pytest.approx(step, rel=0.01) and sensor.quantum == 0
-        assert sensor.range_noise >= 0.99 * step / np.sqrt(12)
+def test_disparity_rounded_to_steps_tells_the_step():
     random = np.random.default_rng(6)
     inverse = three_planes() + 0.001 * smooth_field(CAMERA.shape, (2.0, 2.0), random)
     sensor = sensor_of(0.0029 * np.rint(inverse / 0.0029))
@@ -232,7 +218,7 @@ def test_an_image_that_says_too_little_leaves_what_is_known():
     assert sensor_of(inverse) == STATED
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 1000), st.floats(0, 1), st.sampled_from([1e-6, 1.0, 1e5]))
 def test_whatever_the_image_the_model_is_finite(seed, holes, scale):
     random = np.random.default_rng(seed)
@@ -249,7 +235,6 @@ def test_whatever_the_image_the_model_is_finite(seed, holes, scale):
 
 
 def test_steps_are_those_of_the_flat_blocks_around():
-    """By the definition, block for block."""
     draw, shape = np.random.default_rng(9), (9, 11)
     sensor = STATED._replace(noise=0.001, quantum=0.003, range_quantum=0.004, direction_noise=0.4)
     slope = draw.exponential(1e-5, shape)
@@ -258,19 +243,15 @@ def test_steps_are_those_of_the_flat_blocks_around():
     freedom = moments[..., COUNT] - 3
     tilt = 0.16 * slope
     residual = draw.choice([0.99, 1.01, 9], shape) * ROUGH * (1e-6 + tilt) * freedom
-    found = jump_steps(Blocks(moments, squared, slope, residual), sensor)
+    steps = jump_steps(Blocks(moments, squared, slope, residual), sensor)
     flat = (freedom > 0) & (residual < ROUGH * (1e-6 + tilt) * freedom)
-    for i, j in np.ndindex(shape):
-        window = np.s_[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2]
-        told = flat[window] if not flat[i, j] else np.zeros_like(flat[window])
-        slopes = slope[i, j] if flat[i, j] else slope[window][told]
-        least, most = np.min(slopes, initial=1), np.max(slopes, initial=0)
-        least = least if flat[i, j] or told.any() else 0
-        steps = [5 * np.sqrt(0.72 * sensor.agreement * (1e-6 + 0.16 * t)) for t in (least, most)]
-        steps = np.maximum(steps, 2.2 * max(0.003, 0.004 * squared[i, j]))
-        assert (found.windows[i, j], found.pixels[i, j]) == pytest.approx(tuple(steps), rel=1e-5)
-        assert found.slopes[i, j] == pytest.approx(np.sqrt(least), rel=1e-5)
-    assert 20 < flat.sum() < 60
+    around = minimum_filter(np.where(flat, slope, 9), 3), maximum_filter(flat * slope, 3)
+    # 0 where none around is flat.
+    least, most = (np.where(flat, slope, np.where(found < 9, found, 0)) for found in around)
+    known = [5 * np.sqrt(0.72 * sensor.agreement * (1e-6 + 0.16 * t)) for t in (least, most)]
+    known = np.maximum(known, 2.2 * np.maximum(0.003, 0.004 * squared))
+    np.testing.assert_allclose(steps, [*known, np.sqrt(least)], rtol=1e-5)
+    assert 20 < flat.sum() < 60 and (maximum_filter(flat, 3) == 0).any()
 
 
 @pytest.mark.parametrize('width', [0.7, 2.0, 4.0])
