@@ -27,6 +27,8 @@ FACES = np.array(
     [(0, 0, 1, 0), (0, 0, -1, 2.5), (-1, 0, 0, 3), (1, 0, 0, 3), (0, 1, 0, 2), (0, -1, 0, 2)]
 )
 NOISE = PoseNoise(0.005, np.radians(0.3))
+# As the map has them before.
+START = [map_plane(k + 1, f[:3], -f[:3] * f[3], 0.01) for k, f in enumerate(FACES)]
 IDENTITY = Transform.identity()
 # Of planes as a sensor shows them: direction about two axes, and offset.
 SIGMA = np.array([0.004, 0.004, 0.003])
@@ -59,14 +61,19 @@ def sighting(pose, planes, *about):
     return Sighting(pose, seen, *about, np.zeros((1, 3)))
 
 
+def walked(k, frames):
+    """Pose of a camera that walks 4 m along a room."""
+    turn = Rotation.from_rotvec(0.3 * np.sin([k / 7, k / 9, k / 5])).as_matrix()
+    return Transform(turn, np.array([-2 + 4 * k / frames, 0.3 * np.sin(k / 5), 1.2]))
+
+
 def solved(seed, drift=(0, 0, 0), frames=40, moving=0.0, odometry=False):
-    """Solution for a camera that walks 4 m along a room, and its true poses."""
+    """Solution for a camera that walks along a room, and its true poses."""
     random = np.random.default_rng(seed)
     adjustment, truths, way = Adjustment(NOISE, odometry), [], 0.0
     told_off = np.zeros(3)
     for k in range(frames):
-        turn = Rotation.from_rotvec(0.3 * np.sin([k / 7, k / 9, k / 5])).as_matrix()
-        truth = Transform(turn, np.array([-2 + 4 * k / frames, 0.3 * np.sin(k / 5), 1.2]))
+        truth = walked(k, frames)
         way += np.linalg.norm(truth.shift - truths[-1].shift) if truths else 0
         off = Rotation.from_rotvec(random.normal(0, NOISE.turn, 3)).as_matrix()
         fresh = random.normal(0, NOISE.shift, 3)
@@ -80,8 +87,11 @@ def solved(seed, drift=(0, 0, 0), frames=40, moving=0.0, odometry=False):
         planes = [seen(random, f, truth, own) for f, own in zip(faces, lasting, strict=True)]
         adjustment.add(sighting(told, planes, np.arange(1, len(FACES) + 1), begins))
         truths.append(truth)
-    start = [map_plane(k + 1, f[:3], -f[:3] * f[3], 0.01) for k, f in enumerate(FACES)]
-    return adjustment.solve(start, {}), truths
+    return adjustment.solve(START, {}), truths
+
+
+def rms(values):
+    return np.sqrt(np.mean(np.square(values)))
 
 
 def errors_of(solution, truths):
@@ -106,8 +116,7 @@ def test_errors_are_as_small_as_stated_and_poses_better_than_told():
         ]
         assert not solution.drifts
     assert 0.7 < np.mean(nees) < 1.5
-    assert np.sqrt(np.mean(np.square(shifts))) < 0.75 * NOISE.shift
-    assert np.sqrt(np.mean(np.square(turns)) / 3) < 0.75 * NOISE.turn
+    assert rms(shifts) < 0.75 * NOISE.shift and rms(turns) < 0.75 * 3**0.5 * NOISE.turn
 
 
 def test_drift_is_found_and_taken_off():
@@ -118,14 +127,11 @@ def test_drift_is_found_and_taken_off():
         gap = solution.drift - told
         assert gap @ np.linalg.solve(solution.drift_covariance, gap) < 16.3
         assert np.linalg.norm(gap) < 0.003
-        _, shift = errors_of(solution, truths)
-        assert np.sqrt(np.mean(np.square(shift))) < 0.01
+        assert rms(errors_of(solution, truths)[1]) < 0.01
 
 
 def test_a_plane_that_moves_does_not_move_the_camera():
-    solution, truths = solved(3, moving=0.3)
-    _, shift = errors_of(solution, truths)
-    assert np.sqrt(np.mean(np.square(shift))) < 0.01
+    assert rms(errors_of(*solved(3, moving=0.3))[1]) < 0.01
 
 
 def test_errors_of_an_odometry_add_up_and_planes_take_them_off():
@@ -210,9 +216,8 @@ def test_the_distortion_of_the_sensor_is_told_from_the_planes():
         sensed = observations(planes, views, told, NOISE)
         for adjustment, rays in zip(adjustments, (RAYS, 0 * RAYS), strict=True):
             adjustment.add(Sighting(told, sensed, np.array(ids, int), begins, rays.reshape(-1, 3)))
-    start = [map_plane(k + 1, f[:3], -f[:3] * f[3], 0.01) for k, f in enumerate(FACES)]
     for adjustment in adjustments:
-        solution = adjustment.solve(start, {})
+        solution = adjustment.solve(START, {})
         off.append([plane.distance for plane in solution.planes] - FACES[:, 3])
         found.append(solution.field)
     np.testing.assert_allclose(found[0], field, atol=0.002)
@@ -246,20 +251,16 @@ def test_what_a_jump_was_taken_for_wrongly_is_taken_off():
         turn = Rotation.from_rotvec(wrong[:3]).as_matrix()
         moved = Transform(turn, camera + wrong[3:] - turn @ camera)
         for k in range(24):
-            body = Rotation.from_rotvec(0.3 * np.sin([k / 7, k / 9, k / 5])).as_matrix()
-            truth = Transform(body, np.array([-2 + k / 6, 0.3 * np.sin(k / 5), 1.2]))
+            truth = walked(k, 24)
             told = truth.by(random.normal(0, NOISE.deviations))
             # Most frames before it show floor and ceiling only.
             shown = 6 if k in (0, 9, 17) or k >= 18 else 2
             planes = [seen(random, f, truth, np.zeros(3)) for f in FACES[:shown]]
-            ids, begins = np.arange(shown) + 1, np.full(shown, True)
-            jump = Jump(Transform.identity(), camera, wrong, told_spread) if k == 18 else None
+            jump = Jump(IDENTITY, camera, wrong, told_spread) if k == 18 else None
             told = moved.after(told) if k < 18 else told
-            seen_now = sighting(told, planes, ids, begins)
-            adjustment.add(seen_now._replace(jump=jump))
+            now = sighting(told, planes, np.arange(shown) + 1, np.full(shown, True))
+            adjustment.add(now._replace(jump=jump))
             truths.append(truth)
-        start = [map_plane(k + 1, f[:3], -f[:3] * f[3], 0.01) for k, f in enumerate(FACES)]
-        solution = adjustment.solve(start, {})
-        off.append([a.shift - b.shift for a, b in zip(solution.poses, truths, strict=True)][:18])
-    known, unknown = np.sqrt(np.mean(np.square(off), axis=(1, 2)))
+        off.append(errors_of(adjustment.solve(START, {}), truths)[1][:18])
+    known, unknown = map(rms, off)
     assert known < 0.01 < unknown / 5
