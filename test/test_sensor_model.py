@@ -289,6 +289,9 @@ def test_a_patch_is_what_the_mean_of_four_pixels_keeps_of_the_noise(white, width
     field = np.exp(-squared / (4 * width**2)) if width else np.eye(4)
     covariance = white * np.eye(4) + (1 - white) * field
     assert sensor.patch == pytest.approx(4 * covariance.mean(), rel=1e-9)
+    # And a large region: the sum of all correlations with a pixel.
+    alike = np.exp(-(np.arange(-40, 41) ** 2) / (4 * width**2)).sum() ** 2 if width else 1
+    assert sensor.correlated == pytest.approx(white + (1 - white) * alike, rel=1e-6)
 
 
 def test_what_is_said_of_the_errors():
