@@ -16,6 +16,12 @@ from rangeseg_ros.simulation.sensors.stereo import BASELINE, RealSense, distorti
 from rangeseg_ros.simulation.solids import box, half_space
 
 
+@pytest.mark.parametrize('name', SENSORS)
+def test_sensors_look_straight_ahead(name):
+    camera = SENSORS[name].camera
+    assert (camera.cx, camera.cy) == ((camera.width - 1) / 2, (camera.height - 1) / 2)
+
+
 def in_camera_frame(*solids):
     return Scene(solids, (Pose(np.eye(3), np.zeros(3)),))
 

@@ -46,7 +46,7 @@ def room():
 
 
 def record(path, tilt):
-    """A robot that turns before the door, with the tf of a frame turned by `tilt`."""
+    """A robot that turns before the door, with the tf of a frame turned by `tilt`, or without."""
     recording, random = Recording(), np.random.default_rng(3)
     for k in range(FRAMES):
         stamp = 10**18 + k * 100_000_000
@@ -59,6 +59,8 @@ def record(path, tilt):
         depth = np.where(inverse > 1 / 6, 1000 / np.maximum(inverse, 1 / 6), 0)
         recording.add_camera(stamp, CAMERA.width, CAMERA.height, k=CAMERA.matrix.ravel())
         recording.add_image(stamp, np.round(depth.reshape(CAMERA.shape)).astype(np.uint16))
+        if tilt is None:
+            continue
         told, at = tilt * turn, tilt.apply(place)
         for after in (-20_000_000, 20_000_000):
             recording.add_transform(stamp + after, 'odom', 'optical', told.as_quat(), at)
@@ -109,6 +111,15 @@ def test_the_plan_is_that_of_the_room(folders, name):
         (x1, y1), (x2, y2) = opening['geometry']['coordinates']
         assert [x1, x2] == pytest.approx([AHEAD, AHEAD], abs=0.02)
         assert sorted([y1, y2]) == pytest.approx(DOOR, abs=0.06)
+
+
+def test_without_transforms_the_planes_tell_how_the_camera_moved(folders, tmp_path):
+    record(tmp_path / 'bag', None)
+    words = '--params', folders / 'tilted.yaml', '--output', tmp_path / 'out'
+    result = run('plan', tmp_path / 'bag', *words)
+    assert result.exit_code == 0, result.output
+    (opening,) = of_role(tmp_path / 'out', 'opening')
+    assert opening['properties']['width'] == pytest.approx(DOOR[1] - DOOR[0], abs=0.1)
 
 
 def test_up_that_nobody_states_is_found(folders):

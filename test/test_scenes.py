@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.ground.cells import DROP
+from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.cameras import read_camera
@@ -19,10 +19,11 @@ from rangeseg_ros.simulation import scenes
 from rangeseg_ros.simulation.render import NOT_PLANAR, simulate, visible_regions
 from rangeseg_ros.simulation.scenes import Pose, Scene, curved_scene
 from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
+from rangeseg_ros.simulation.sensors.sensor import Ideal
 from rangeseg_ros.simulation.sensors.stereo import RealSense
 from rangeseg_ros.simulation.solids import box, cast, cylinder, half_space, prism, sphere
-from rangeseg_ros.simulation.terrain.frame import simulate_terrain
-from rangeseg_ros.simulation.terrain.kinds import terrain_scene
+from rangeseg_ros.simulation.terrain.frame import LEAST, simulate_terrain
+from rangeseg_ros.simulation.terrain.kinds import HARD, KINDS, terrain_scene
 from rangeseg_ros.simulation.terrain.scene import Site
 
 ORIGIN = np.zeros(3)
@@ -119,6 +120,22 @@ def test_points_of_a_region_lie_on_its_plane(build, seed):
         assert np.abs(points[mask] @ plane.normal + plane.distance).max() < 2e-6
     curved = frame.labels == NOT_PLANAR
     assert curved.mean() > 0.01 if build is scenes.curved_scene else not curved.any()
+
+
+@pytest.mark.parametrize('kind', [*KINDS, *HARD])
+def test_heights_of_every_kind_of_terrain_are_those_of_its_parts(kind):
+    """Ground is at 0 but for gaps of 2 mm, objects stand on it, and drops are below it."""
+    camera = Camera(80, 60, 72.0, 72.0, 39.5, 29.5)
+    for seed in range(6):
+        frame = simulate_terrain(terrain_scene(kind, seed), Ideal(0), camera, seed)
+        top = frame.size + (0.05 if kind == 'overhead' else 0)  # of the middle of a bar
+        deepest = -np.inf if kind == 'slope' else -frame.size
+        # Under objects waves are not known exactly.
+        least = 0.04 if kind == 'waves' else 1e-5
+        bounds = {GROUND: (-0.002, 0), OBSTACLE: (0, top), DROP: (deepest, -LEAST)}
+        for terrain, (low, high) in bounds.items():
+            within = (frame.height > low - least) & (frame.height < high + least)
+            assert within[frame.terrain == terrain].all(), (seed, terrain)
 
 
 def test_parts_of_a_terrain_are_where_they_say():
