@@ -129,7 +129,8 @@ def _changes(node: ast.expr) -> Iterator[ast.expr]:
     elif isinstance(node, ast.Constant) and isinstance(node.value, bool):
         yield ast.Constant(not node.value)
     elif isinstance(node, ast.Constant) and isinstance(node.value, int | float):
-        yield ast.Constant(node.value + 1)
+        # One more is little of a large number.
+        yield ast.Constant(node.value + 1 if abs(node.value) <= 10 else 2 * node.value)
 
 
 def run(
