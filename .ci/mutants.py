@@ -191,7 +191,7 @@ def main() -> int:
     parser.add_argument('--seconds', type=float, default=60, help='of tests for each, about')
     parser.add_argument('--name', default='', help='of names (path: before -> after): a pattern')
     parser.add_argument('--least', type=float, default=0.85, help='share that is to die')
-    parser.add_argument('--limit', type=float, default=600, help='seconds for one')
+    parser.add_argument('--limit', type=float, default=200, help='seconds for one')
     parser.add_argument('--jobs', type=int, default=1, help='mutants at the same time')
     parser.add_argument('--minutes', type=float, default=math.inf, help='begin none after that')
     chosen = parser.parse_args()
