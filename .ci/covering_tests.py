@@ -19,7 +19,10 @@ _PHASE = re.compile(r'(\||\s\()(setup|run|call|teardown)\)?$')
 
 
 class _Scope(NamedTuple):
-    """A function, or a definition of a module or class, and whether coverage sees who runs it."""
+    """A function, or a definition of a module or class, and whether coverage sees who runs it.
+
+    The name is a regular expression.
+    """
 
     name: str
     first: int
@@ -42,7 +45,8 @@ class CoveringTests:
         for path in [*PACKAGE.rglob('*.py'), *(ROOT / 'test').glob('*.py')]:
             contexts = data.contexts_by_lineno(str(path))
             self._tests[path] = {
-                line: {_PHASE.sub('', name) for name in names} for line, names in contexts.items()
+                line: {_PHASE.sub('', name) for name in names if name}
+                for line, names in contexts.items()
             }
             for tests in self._tests[path].values():
                 self._lines.update(tests)
@@ -56,11 +60,12 @@ class CoveringTests:
     def of(self, path: Path, first: int, last: int, seconds: float) -> list[str]:
         """Tests of the lines `first` to `last`: as many as take `seconds`, or one."""
         scope = self._scope(path, first)
+        found: set[str] = set()
         if scope and scope.traced:
             # An operand in a line of its own may have no event.
             found = self._of_lines(path, first, last) or self._of_function(path, scope)
-        else:
-            found = self._of_users(scope.name if scope else path.stem)
+        # Or what a function does as others are defined.
+        found = found or self._of_users(scope.name if scope else path.stem)
         chosen: list[str] = []
         for test in sorted(found & self._seconds.keys(), key=lambda t: (self._lines[t], t)):
             if self._seconds[test] < seconds or not chosen:
@@ -84,7 +89,7 @@ class CoveringTests:
         found: set[str] = set()
         names = [name]
         for each in names:
-            pattern = re.compile(rf'\b{re.escape(each)}\b')
+            pattern = re.compile(rf'\b({each})\b')
             for path, text in self._text.items():
                 for number, line in enumerate(text, 1):
                     scope = self._scope(path, number) if pattern.search(line) else None
@@ -104,11 +109,13 @@ def _scopes(path: Path) -> list[_Scope]:
             if isinstance(node, ast.FunctionDef):
                 decorators = ' '.join(map(ast.unparse, node.decorator_list))
                 traced = not re.search('jit|cache', decorators)
-                found.append(_Scope(node.name, node.lineno, node.end_lineno, traced))
+                first = min([node.lineno, *(each.lineno for each in node.decorator_list)])
+                found.append(_Scope(node.name, first, node.end_lineno, traced))
             elif isinstance(node, ast.Assign | ast.AnnAssign):
                 target = node.targets[0] if isinstance(node, ast.Assign) else node.target
-                if isinstance(target, ast.Name) and not isinstance(body, ast.FunctionDef):
-                    found.append(_Scope(target.id, node.lineno, node.end_lineno, False))
+                names = [part.id for part in ast.walk(target) if isinstance(part, ast.Name)]
+                if not isinstance(body, ast.FunctionDef):
+                    found.append(_Scope('|'.join(names), node.lineno, node.end_lineno, False))
             if isinstance(node, ast.FunctionDef | ast.ClassDef):
                 bodies.append(node)
     return found
