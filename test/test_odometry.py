@@ -195,6 +195,10 @@ def test_a_straight_edge_tells_nothing_along_itself_and_few_points_nothing():
     turned = pose.by(np.array([0.3, -0.2, 0.5, 1.0, 2.0, 3.0]))
     design, _ = edge.motion(edge, turned, turned, prior)
     np.testing.assert_allclose(design[:, :6], -design[:, 6:], atol=1e-6)
+    # Of poses that are known, what is farther off than points err has no counterpart.
+    for off, told in ((0.002, True), (0.02, False)):
+        beside = JumpPoints(points + [0, off, 0], 0.004)
+        assert bool(edge.motion(beside, pose, pose, 0 * prior)[0].size) == told
     few = JumpPoints(points[:15], 0.004)
     assert not few.motion(edge, pose, pose, prior)[0].size
     assert not edge.motion(JumpPoints.of(None, None, None), pose, pose, prior)[0].size

@@ -110,12 +110,13 @@ def test_the_evidence_is_that_of_residuals_along_the_crease():
     """Against least squares of all cells at once."""
     inverse = 0.5 + 0.05 * X - 0.2 * X**2 - 0.05 * X * CAMERA.rays[..., 1]
     sums, _, theta, *_ = fitted(inverse, np.where(X < 0.1, 1, 2))
-    found = _evidence(sums, 1, 2, theta, SENSOR, SENSOR.correlated)
+    sensor = SENSOR._replace(range_noise=0.01)
+    found = _evidence(sums, 1, 2, theta, sensor, sensor.correlated)
     parts = [sums.cells[sums.start[k] : sums.start[k + 1]] for k in (1, 2)]
     cells, part = np.vstack(parts), np.repeat([0, 1], [len(one) for one in parts])
     root = np.sqrt(cells[:, COUNT])
     level = cells[:, RAY:INVERSE] @ theta[1:].T / cells[:, WEIGHT, None]
-    deviation = np.sqrt(random_variance(SENSOR, level**2))
+    deviation = np.sqrt(random_variance(sensor, level**2))
     residual = (cells[:, INVERSE] / cells[:, WEIGHT])[:, None] - level
     residual *= root[:, None] / deviation
     own, other = residual[np.arange(len(part)), part], residual[:, 0]
@@ -125,7 +126,7 @@ def test_the_evidence_is_that_of_residuals_along_the_crease():
     crease = planes - terms @ np.linalg.lstsq(terms, planes, rcond=None)[0]
     for k in range(2):
         mine = part == k
-        noise = max(SENSOR.correlated, own[mine] @ own[mine] / (mine.sum() - 3))
+        noise = max(sensor.correlated, own[mine] @ own[mine] / (mine.sum() - 3))
         ratio = own[mine] @ own[mine] - ((own + crease)[mine] ** 2).sum()
         assert found[k] == pytest.approx(ratio / (2 * noise), rel=1e-5)
     assert min(found) > 0
