@@ -197,7 +197,7 @@ def test_a_straight_edge_tells_nothing_along_itself_and_few_points_nothing():
     np.testing.assert_allclose(design[:, :6], -design[:, 6:], atol=1e-6)
     # Of poses that are known, what is farther off than points err has no counterpart.
     for off, told in ((0.002, True), (0.02, False)):
-        beside = JumpPoints(points + [0, off, 0], 0.004)
+        beside = JumpPoints(points + np.array([0, off, 0]), 0.004)
         assert bool(edge.motion(beside, pose, pose, 0 * prior)[0].size) == told
     few = JumpPoints(points[:15], 0.004)
     assert not few.motion(edge, pose, pose, prior)[0].size
