@@ -101,6 +101,19 @@ def test_a_height_is_remembered_as_long_as_planes_are():
     assert memory.recall_height(10**9) == 0
 
 
+@pytest.mark.parametrize(
+    ('second', 'height', 'variance'),
+    [(0.15, 0.14, 8e-5), (0.05, 0.06, 8e-5), (0.2, 0.2, 1e-4), (0.0, 0.0, 1e-4)],
+)
+def test_heights_of_a_cell_are_filtered_until_they_contradict(second, height, variance):
+    memory = GroundMemory(Config())
+    for seen, square in ((0.1, 4e-4), (second, 1e-4)):
+        points = np.array([[0.01, 0.02, seen - 0.01], [0.02, 0.01, seen + 0.01]])
+        memory._count(GROUND, points, np.full(2, square), 0.0)
+    assert memory._layers[1, 0, 0] == pytest.approx(height)
+    assert memory._layers[2, 0, 0] == pytest.approx(variance)
+
+
 def test_time_that_goes_back_forgets():
     drive = Drive()
     drive.grid(0, 5)
