@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from map_squares import plane as map_plane
 from scipy.spatial.transform import Rotation
 
@@ -114,6 +115,8 @@ def test_errors_are_as_small_as_stated_and_poses_better_than_told():
             Rotation.from_matrix(a.rotation @ b.rotation.T).magnitude()
             for a, b in zip(solution.poses, truths, strict=True)
         ]
+        way = np.diff([truth.shift for truth in truths], axis=0)
+        assert solution.way == pytest.approx(np.linalg.norm(way, axis=1).sum(), rel=0.015)
         assert not solution.drifts
     assert 0.7 < np.mean(nees) < 1.5
     assert rms(shifts) < 0.75 * NOISE.shift and rms(turns) < 0.75 * 3**0.5 * NOISE.turn

@@ -253,6 +253,7 @@ SENSORS = {
     'systematic': SensorModel(0.01 * UNIT, 0, 1.0, 2, 0.5 * UNIT, 0, 35),
     'all': SensorModel(0.45 * UNIT, 0, 0.33, 2, 0.5 * UNIT, 0, 35),
     'laser': SensorModel(0, 2 * UNIT, 0.2, 2, 0, 2 * UNIT, 20),
+    'white laser': SensorModel(0, 2 * UNIT, 1.0, 2, 0, 0, 20),
 }
 
 

@@ -122,6 +122,10 @@ def test_points_of_a_region_lie_on_its_plane(build, seed):
     assert curved.mean() > 0.01 if build is scenes.curved_scene else not curved.any()
 
 
+def test_a_half_space_has_the_plane_of_any_normal():
+    np.testing.assert_allclose(half_space((0, 0, -2), (1, 0, 3)).planes, [[0, 0, -1, 3]])
+
+
 @pytest.mark.parametrize('kind', [*KINDS, *HARD])
 def test_heights_of_every_kind_of_terrain_are_those_of_its_parts(kind):
     """Ground is at 0 but for gaps of 2 mm, objects stand on it, and drops are below it."""
