@@ -177,6 +177,7 @@ def test_pieces_are_detected_by_size_and_distance(run, evaluate, tmp_path):
     assert run(*words, '--output', folder)[0] == 0
     code, figures, out, _ = evaluate(folder)
     rows = figures['detection']
+    assert {size for kind, size, _ in all_pieces() if kind == 'ramp'} == {5, 10, 15, 20}
     assert code == 0 and 'test pieces detected' in out
     assert [(r['kind'], r['size'], r['distance']) for r in rows] == [*all_pieces()]
     for row in rows:

@@ -1,6 +1,7 @@
 """Simulated scenes: ray casting, truth regions, random rooms, and what the command writes."""
 
 import csv
+from dataclasses import replace
 from unittest import mock
 
 import cv2
@@ -140,6 +141,18 @@ def test_heights_of_every_kind_of_terrain_are_those_of_its_parts(kind):
         for terrain, (low, high) in bounds.items():
             within = (frame.height > low - least) & (frame.height < high + least)
             assert within[frame.terrain == terrain].all(), (seed, terrain)
+
+
+def test_rough_ground_has_the_relief_it_says():
+    camera, scene = Camera(80, 60, 72.0, 72.0, 39.5, 29.5), terrain_scene('rough', 0)
+    rough, flat = (
+        simulate_terrain(replace(scene, relief=relief), Ideal(0), camera)
+        for relief in (scene.relief, 0.0)
+    )
+    ground = flat.terrain == GROUND
+    off = (rough.depth - flat.depth)[ground]
+    fall = -(camera.rays @ scene.pose.rotation[2])[ground]
+    assert np.std(off * fall) == pytest.approx(scene.relief, rel=0.1)
 
 
 def test_parts_of_a_terrain_are_where_they_say():
