@@ -165,6 +165,12 @@ def test_all_is_done_where_there_is_time_for_it_or_no_rate_to_hold(rate, most, t
     assert {budget for budget, _ in budgets(Pace(rate, most), 600, **times)} == {most}
 
 
+def test_of_three_frames_two_slow_ones_are_followed_at_once():
+    pace = Pace(30, 1.0)
+    budgets(pace, 3, 0.02)
+    assert [budget for budget, _ in budgets(pace, 3, 3.0)] == [1.0, 1.0, STEPS[-1]]
+
+
 @pytest.mark.parametrize('full', np.linspace(0.024, 0.055, 12))
 def test_the_rate_is_held_without_chatter(full):
     told = budgets(Pace(30, 1.0), 1800, full, spread=0.08)
