@@ -109,7 +109,7 @@ def test_silence_counts_from_the_first_frame_without_an_answer(clock):
 
 
 def test_losses_are_believed_that_a_camera_can_have_had(clock):
-    for count in (2**31 - 1, -(2**31), -1, 0, 10**6):
+    for count in (2**31 - 1, -(2**31), -1, 0, 2):
         losses = Losses()
         losses.arrived(None)
         losses.report(count)
