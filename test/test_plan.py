@@ -1,6 +1,7 @@
 """From a recording to a plan: every file is opened by what its users would open it with."""
 
 import json
+import re
 import xml.etree.ElementTree as ET
 
 import cv2
@@ -171,6 +172,9 @@ def test_other_programs_open_the_files(folders):
     assert {'WALLS', 'OPENINGS', 'FLOOR', 'PLANES'} <= layers
     walls = document.modelspace().query('LINE[layer=="WALLS"]')
     assert any(abs(w.dxf.start.x - AHEAD) < 0.02 > abs(w.dxf.end.x - AHEAD) for w in walls)
+    texts = [text.dxf.text for text in document.modelspace().query('TEXT[layer=="TEXT"]')]
+    told = {text.partition(':')[0] for text in texts if re.fullmatch(r'\d+: \+-\d\.\d mm', text)}
+    assert told == {str(wall['properties']['id']) for wall in of_role(folder, 'wall')}
     features = json.loads((folder / 'plan.geojson').read_text())['features']
     planes = [f['properties'] for f in features if 'parts' in f['properties']]
     parts = sum(len(part) for plane in planes for part in plane['parts'])

@@ -163,6 +163,18 @@ def test_an_expansion_is_the_best_there_is(seed):
     np.testing.assert_allclose(cost[known], cost_of(labels, problem, models)[known], atol=1e-4)
 
 
+def test_blocks_without_a_surface_begin_with_the_best_around_them():
+    problem, models, labels = random_case(0, 2 * BLOCK, 4 * BLOCK)
+    surfaces = np.array([[1, 0, 3, 2], [1, 0, 3, 2]], np.int32)
+    labels, data = labels.ravel(), np.zeros(labels.size, np.float32)
+    refinement._label_blocks(surfaces, labels, data, problem, models)
+    cost = unary(problem, models)
+    best = np.where(cost[1] < cost[3], 1, 3) * (np.minimum(cost[1], cost[3]) < cost[0])
+    expected = surfaces.repeat(BLOCK, 0).repeat(BLOCK, 1)
+    expected = np.where(expected > 0, expected, best) * (cost[0] > 0)
+    np.testing.assert_array_equal(labels, expected.ravel())
+
+
 def test_a_label_is_expanded_as_far_as_it_gains():
     """Beyond the band around its borders, too."""
     problem, models, labels = random_case(0, 30, 40)

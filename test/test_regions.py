@@ -16,14 +16,16 @@ def test_components_of_random_images(seed):
     labels = random.integers(0, 3, (h, w))
     horizontal, vertical = random.random((h, w - 1)) < 0.8, random.random((h - 1, w)) < 0.8
     index = np.arange(h * w).reshape(h, w)
-    right = horizontal & (labels[:, 1:] == labels[:, :-1])
-    below = vertical & (labels[1:] == labels[:-1])
+    valid = random.random((h, w)) < 0.9
+    right = horizontal & (labels[:, 1:] == labels[:, :-1]) & valid[:, 1:] & valid[:, :-1]
+    below = vertical & (labels[1:] == labels[:-1]) & valid[1:] & valid[:-1]
     i = np.concatenate([index[:, :-1][right], index[:-1][below]])
     j = np.concatenate([index[:, 1:][right], index[1:][below]])
     count, expected = graph_components(coo_array((np.ones(len(i)), (i, j)), (h * w, h * w)))
-    found = connected_components(labels, Grid(horizontal, vertical), np.ones((h, w), bool))
-    pairs = np.unique(np.stack([found.ravel(), expected]), axis=1)
-    assert pairs.shape[1] == count == found.max() and found.min() == 1
+    found = connected_components(labels, Grid(horizontal, vertical), valid)
+    pairs = np.unique(np.stack([found[valid], expected[valid.ravel()]]), axis=1)
+    assert pairs.shape[1] == count - np.count_nonzero(~valid) == found.max()
+    np.testing.assert_array_equal(found > 0, valid)
 
 
 def test_regions_left_keep_their_order():
