@@ -11,6 +11,7 @@ from rangeseg_ros import Camera, Config, RangeImage, Segmenter, SequenceSegmente
 from rangeseg_ros.core.ground.cells import GROUND
 from rangeseg_ros.core.ground.points import outlines
 from rangeseg_ros.core.rotations import rotation_by, rotation_matrix
+from rangeseg_ros.core.sensing.clouds import completed_rays
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.solids import cast
@@ -196,6 +197,19 @@ def test_no_place_is_made_up(name, frame):
     assert image.camera is None and not image.place.any()
     known, moved = np.isfinite(points).all(axis=2), points @ frame[0].T + frame[1]
     np.testing.assert_allclose(image.points[known], moved[known], rtol=1e-5)
+
+
+@pytest.mark.parametrize('hole', [np.s_[20:30, 30:50], np.s_[:0]])
+def test_rays_of_holes_follow_those_around(hole):
+    """Of a scanner, whose columns and rows are angles, with and without a hole."""
+    fall, turn = (0.01 * (n - 30) for n in np.indices((60, 80)))
+    rays = np.stack([np.sin(turn) * np.cos(fall), np.sin(fall), np.cos(turn) * np.cos(fall)], 2)
+    rays, valid = rays.astype(np.float32), np.ones((60, 80), bool)
+    valid[hole] = False
+    completed, between = completed_rays(np.where(valid[..., None], rays, 0), valid)
+    assert between.all()
+    np.testing.assert_allclose(completed, rays, atol=1e-5)
+    np.testing.assert_array_equal(completed[valid], rays[valid])
 
 
 def test_a_sequence_is_followed_as_that_of_the_depth_images():

@@ -132,6 +132,22 @@ def test_the_evidence_is_that_of_residuals_along_the_crease():
     assert min(found) > 0
 
 
+@pytest.mark.parametrize(('bend', 'width'), [(1.0, 0.15), (1.0, 0.1), (0.5, 0.1), (0.2, 0.08)])
+def test_two_regions_are_one_surface_as_far_as_their_evidence_says(bend, width):
+    """Each is told as much from the same probability of both together."""
+    inverse = 0.5 + 0.05 * X - bend * X**2 - 0.05 * X * CAMERA.rays[..., 1]
+    inside = (-0.6 * width < X) & (width > X) & (abs(CAMERA.rays[..., 1]) < width)
+    regions = np.where(X < 0, 1, 2) * inside
+    sums, _, theta, *_ = fitted(inverse, regions)
+    own = np.array(_evidence(sums, 1, 2, theta, SENSOR, SENSOR.correlated))
+    alone, beside = (
+        probabilities(inverse, regions, 0, pairs)[1:] for pairs in (NO_PAIRS, [[1, 2]])
+    )
+    share = 1 / (1 + np.exp(-own) + np.exp(-own.sum()))
+    together = alone + (beside - alone) / share
+    assert together[0] == pytest.approx(together[1], abs=1e-6) and abs(beside - alone).max() > 1e-3
+
+
 def test_what_tells_nothing_has_the_prior():
     regions = np.zeros(CAMERA.shape, int)
     regions[100, 100] = 1

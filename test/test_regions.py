@@ -5,7 +5,13 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components as graph_components
 
-from rangeseg_ros.core.regions import connected_components, numbers_of, plane_regions, relabel
+from rangeseg_ros.core.regions import (
+    connected_components,
+    least_pixels,
+    numbers_of,
+    plane_regions,
+    relabel,
+)
 from rangeseg_ros.core.sensing.grid import Grid
 
 
@@ -26,6 +32,11 @@ def test_components_of_random_images(seed):
     pairs = np.unique(np.stack([found[valid], expected[valid.ravel()]]), axis=1)
     assert pairs.shape[1] == count - np.count_nonzero(~valid) == found.max()
     np.testing.assert_array_equal(found > 0, valid)
+
+
+def test_the_smallest_plane_follows_the_image():
+    assert [least_pixels(0, shape) for shape in ((480, 640), (240, 320), (1, 1))] == [300, 75, 1]
+    assert least_pixels(7, (480, 640)) == 7
 
 
 def test_regions_left_keep_their_order():

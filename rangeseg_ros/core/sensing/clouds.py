@@ -109,6 +109,8 @@ def completed_rays(
         before = np.logical_or.accumulate(valid, axis)
         between |= before & np.flip(np.logical_or.accumulate(np.flip(valid, axis), axis), axis)
     v, u = np.nonzero(between & ~valid)
+    if not len(v):  # NumPy makes no polynomials of nothing
+        return rays, between
     found = _basis(v, u, valid.shape) @ coefficients
     completed = rays.copy()
     completed[v, u] = found / np.linalg.norm(found, axis=1, keepdims=True)
