@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from rangeseg_ros import Camera, Config, ConfigError, RangeImage, Transform
 from rangeseg_ros.batch.replay import Replay
 from rangeseg_ros.core.mapping.edges import JumpPoints
-from rangeseg_ros.core.mapping.observations import views
+from rangeseg_ros.core.mapping.observations import PoseNoise, observations, views
 from rangeseg_ros.core.mapping.odometry import _POSES, PlaneOdometry
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -167,6 +167,21 @@ def test_points_without_a_counterpart_move_the_camera_by_less_than_their_share()
         shifts = [told_of_motion(points, now)[0][3:] for points in (last, hidden)]
         moved.append(np.linalg.norm(shifts[1] - shifts[0]))
     assert np.median(moved) < np.linalg.norm(aside) / 9
+
+
+def test_new_planes_err_as_the_pose_from_which_they_are_seen():
+    """What corrects the pose moves them along."""
+    draw, odometry, (planes, view) = np.random.default_rng(0), PlaneOdometry(), still(1)
+    seen = observations(planes, view, Transform.identity(), PoseNoise(0.0, 0.0))
+    pose = Transform(Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(), np.array([1.0, -2, 0.5]))
+    root = draw.normal(size=(18, 18))
+    odometry._covariance = prior = root @ root.T
+    odometry._append(pose, seen, np.arange(len(planes)))
+    effect = odometry._covariance[18:, :18] @ np.linalg.inv(prior)
+    error = 1e-5 * draw.normal(size=18)
+    corrected = odometry._planes.without((effect @ error).reshape(-1, 3))
+    moved = seen.planes.moved(pose.by(error[:6]))
+    np.testing.assert_allclose(corrected.equations, moved.equations, atol=1e-8)
 
 
 def test_edges_are_taken_in_as_a_filter_does():
