@@ -116,9 +116,12 @@ def test_what_is_none_is_refused_in_one_line(depth, tmp_path):
             np.save(tmp_path / name, content)
         with pytest.raises(ValueError, match=words):
             read_frame(tmp_path / name, Intrinsics(fov=60))
-    write_ply(tmp_path / 'unsized.ply', points, size=False)
-    with pytest.raises(ValueError, match='each pixel of an organised cloud'):
-        read_frame(tmp_path / 'unsized.ply', Intrinsics(fov=60))
+    write_ply(tmp_path / 'sized.ply', points)
+    sized = (tmp_path / 'sized.ply').read_bytes()
+    for name in ('num_cols', 'num_rows'):  # both are needed
+        (tmp_path / 'unsized.ply').write_bytes(sized.replace(f'obj_info {name} '.encode(), b'x '))
+        with pytest.raises(ValueError, match='each pixel of an organised cloud'):
+            read_frame(tmp_path / 'unsized.ply', Intrinsics(fov=60))
     with pytest.raises(ValueError, match='No such file'):
         read_frame(tmp_path / 'missing.ply', Intrinsics(fov=60))
 
