@@ -31,7 +31,7 @@ SEED ?= 0
 mutants: .coverage
 	$(BIN)/python .ci/mutants.py --count $(COUNT) --seed $(SEED) --jobs 2
 
-.coverage: $(shell git ls-files rangeseg_ros test)
+.coverage: $(shell find rangeseg_ros test -name '*.py')
 	$(MAKE) test COVERAGE=1
 
 # What every mechanism costs and what it buys, on simulated frames and those in DATA: a few minutes.
