@@ -2,44 +2,26 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from clouds import cloud_of
 from scipy.spatial.transform import Rotation
-from scipy.stats import norm
+from terrain_scenes import FLOOR, HEIGHT, drop_of, scene, share
 
-from rangeseg_ros import Camera, Config, RangeImage, Segmenter
+from rangeseg_ros import Config, RangeImage, Segmenter
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN, cells_of
-from rangeseg_ros.core.ground.estimate import HIGHEST, STEPS, continued
 from rangeseg_ros.core.ground.points import drops, outlines, unseen
 from rangeseg_ros.core.ground.reach import reach
-from rangeseg_ros.core.ground.terrain import terrain_of
-from rangeseg_ros.core.segmentation import STATED
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import SequenceSegmenter, with_roles
-from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.sensors.kinect import Kinect
 from rangeseg_ros.simulation.sensors.sensor import resize
-from rangeseg_ros.simulation.solids import box, prism
+from rangeseg_ros.simulation.solids import box
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
 from rangeseg_ros.simulation.terrain.kinds import stated, terrain_scene
-from rangeseg_ros.simulation.terrain.scene import ALL, FAR, Piece, Terrain, slab
+from rangeseg_ros.simulation.terrain.scene import ALL, FAR, Piece, slab
 
 CAMERA = resize(Kinect().camera, 320, 240)
-HEIGHT = 1.0
-FLOOR = slab(-3, FAR, 0, 0, ALL)
-
-
-def scene(*pieces, pitch=30, roll=0, yaw=0, height=HEIGHT):
-    return Terrain('', pieces, (FLOOR,), Pose.looking((0, 0, height), yaw, pitch, roll))
-
-
-def drop_of(depth, edge=1.7):
-    return (
-        Piece(slab(-3, edge, 0, 0, ALL), GROUND),
-        Piece(slab(edge, FAR, -depth, -depth, ALL), DROP, depth),
-    )
 
 
 def box_at(ahead, size, centre=0.0):
@@ -68,14 +50,6 @@ def found(terrain, height=HEIGHT, **parameters):
 
 def in_the_world(points, terrain):
     return points @ terrain.pose.rotation.T + terrain.pose.position
-
-
-def share(classes, frame, true, called):
-    """Of the pixels of a class, away from its borders and within 3.5 m, those called `called`."""
-    truth = cv2.erode((frame.terrain == true).astype(np.uint8), np.ones((7, 7))) > 0
-    truth &= (frame.crossing if true == DROP else frame.depth / 1000) < 3.5
-    assert truth.mean() > 0.003
-    return (classes[truth] == called).mean()
 
 
 @pytest.mark.parametrize('height', [HEIGHT + 0.01, 0.0])
@@ -286,112 +260,3 @@ def test_no_chain_goes_down_an_edge_that_is_blurred_over_two_cells():
     place = np.stack([height, 2.0 + 0.04 * rows, 0.034 * columns])[:, ::-1]
     reached = reach(place, np.full(rows.shape, 0.0055**2), Config(), False)[::-1]
     assert reached[:, :9].all() and not reached[20:, 10:].any()
-
-
-SEEN = np.degrees(np.arctan2(240, Kinect(0).camera.fy))  # below the middle of the image
-ABOVE = 0.8
-
-
-def judged(pieces, pitch, height, up=None, seed=0, camera=ABOVE, yaw=0, config=None):
-    """Terrain as the camera's true or another up has it, and the truth."""
-    terrain = scene(*pieces, pitch=pitch, yaw=yaw, height=camera)
-    frame = simulate_terrain(terrain, Kinect(seed), seed=seed)
-    image = RangeImage.from_depth(frame.depth, Kinect(seed).camera)
-    known = (height, 0.015) if height else (0.0, 0.0)
-    up = terrain.up if up is None else up
-    return terrain_of(image, STATED, up, known, config or Config()), frame
-
-
-@pytest.mark.parametrize('seed', range(3))
-@pytest.mark.parametrize('depth', [0.06, 0.08, 0.1, 0.12, 0.15])
-def test_a_landing_whose_edge_is_out_of_view_is_no_ground(depth, seed):
-    """The floor is hidden up to 1.5 m ahead, and ends before."""
-    pitch = np.degrees(np.arctan2(ABOVE, 1.5)) - SEEN
-    terrain, frame = judged(drop_of(depth, 0.9), pitch, ABOVE, seed=seed)
-    assert share(terrain.classes, frame, DROP, GROUND) < 0.01 and not terrain.stand.found
-    assert 'stated height is 0.80 m' in terrain.stand.reasons[0]
-
-
-@pytest.mark.parametrize('offset', [0.0, 0.02])
-def test_the_ground_continued_errs_as_least_squares_say(offset):
-    random, sd = np.random.default_rng(0), 0.003
-    x, y = random.uniform((1, -1), (2, 1), (400, 2)).T
-    h = offset + 0.03 * x - 0.01 * y + np.tile([0.002, -0.002], 200)
-    seen = continued(np.stack([h, x, y]), np.full(400, sd**2), 0.01, Config())
-    design = np.stack([np.ones(400), x, y], axis=1)
-    plane, square, *_ = np.linalg.lstsq(design, h, rcond=None)
-    assert seen.plane == pytest.approx(plane, abs=2e-4)
-    # As if four cells that err alike were one. What they are off their plane goes on, from the
-    # hundredth part of them that is nearest, over the longest way.
-    start = np.sort(np.hypot(x, y))[4]
-    bent = (1 + 2 * start / 3.2) * np.sqrt(square[0] / 400)
-    known = 4 * sd**2 * np.linalg.inv(design.T @ design)[0, 0]
-    assert seen.error == pytest.approx(np.sqrt(0.01**2 + known + bent**2), rel=1e-3)
-    a, step = seen.plane[0], Config().least_step
-    same = (1 - STEPS) * norm.pdf(a, scale=seen.error)
-    tails = norm.sf(step, a, seen.error) + norm.cdf(-step, a, seen.error)
-    other = STEPS * tails / (2 * (HIGHEST - step))
-    assert seen.confidence == pytest.approx(same / (same + other), rel=1e-9)
-
-
-@pytest.mark.parametrize('error', [-0.5, -0.2, -0.1, 0.1, 0.2, 0.5, 1.0])
-def test_a_wrong_height_is_named_and_nothing_is_ground(error):
-    terrain, _ = judged(drop_of(0.1, 1.5), 30, ABOVE + error)
-    assert not (terrain.classes == GROUND).any()
-    told = f'the stated height is {ABOVE + error:.2f} m, the ground seen is 0.80 m below, '
-    (why,) = terrain.stand.reasons
-    assert why.startswith(told) and why.endswith(
-        ' sd: a step or ramp out of view, or a wrong height'
-    )
-    # Of the stated height, 0.015 m, and of what is seen, a few millimetres.
-    assert float(why.removeprefix(told).split()[0]) == pytest.approx(abs(error) / 0.0166, abs=2)
-
-
-@pytest.mark.parametrize('yaw', [-40, -20, 0])
-def test_what_falls_to_the_side_by_20_degrees_is_no_ground(yaw):
-    turn = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])  # from x, y to y, z of the world
-    level = prism(np.array([(-0.2, -4), (8, -4), (8, 0), (-0.2, 0)]), 20, turn, (0, 0, 0))
-    fall = -7.8 * np.tan(np.radians(20))
-    side = prism(np.array([(-8, -9), (-0.2, -9), (-0.2, 0), (-8, fall)]), 20, turn, (0, 0, 0))
-    pieces = Piece(level, GROUND), Piece(side, DROP, 1.0)
-    terrain, frame = judged(pieces, 28, ABOVE, yaw=yaw)
-    assert share(terrain.classes, frame, DROP, GROUND) < 0.01
-    assert yaw or share(terrain.classes, frame, GROUND, GROUND) > 0.97
-
-
-@pytest.mark.parametrize(('gap', 'kept'), [(0.15, 0.0), (0.5, 0.97)])
-def test_ground_leads_over_gaps_that_the_robot_crosses(gap, kept):
-    pieces = (
-        Piece(slab(-3, 1.2, 0, 0, ALL), GROUND),
-        Piece(slab(1.2, 1.5, -1, -1, ALL), DROP, 1.0),
-        Piece(slab(1.5, FAR, 0, 0, ALL), GROUND),
-    )
-    config = Config(ground_gap=gap, robot_radius=gap + 0.1)
-    terrain, frame = judged(pieces, 28, ABOVE, config=config)
-    beyond = (frame.terrain == GROUND) & (frame.depth > 2100) & (frame.depth < 2600)
-    assert beyond.sum() > 1000
-    assert abs((terrain.classes[beyond] == GROUND).mean() - kept) < 0.03
-
-
-def test_a_table_alone_is_no_floor():
-    table = Piece(box((1.2, 1.6, 0.03), np.eye(3), (0.8, 0, 0.7)), OBSTACLE, 0.7)
-    for height in (0.0, 1.2):
-        terrain, frame = judged((Piece(FLOOR, GROUND), table), 50, height, camera=1.2)
-        assert not (terrain.classes[frame.terrain == OBSTACLE] == GROUND).any()
-
-
-def test_a_level_up_of_a_camera_that_looks_down_makes_nothing_ground():
-    terrain, _ = judged([Piece(FLOOR, GROUND)], 30, ABOVE, up=np.array([0.0, -1.0, 0.0]))
-    assert not (terrain.classes == GROUND).any() and terrain.stand.reasons
-
-
-@pytest.mark.parametrize('metres', [1e4, 1e6, 1e8])
-def test_a_point_at_the_horizon_tells_no_height(metres):
-    """Level with the camera, where errors of the inverse range are none of the height."""
-    camera = Camera(2, 1, 1.0, 1.0, 1.0, 0.0)
-    up = np.array([0.0, -1.0, 0.0])
-    for beside in (0.0, 0.4 * metres, 0.8 * metres):
-        image = RangeImage.from_depth(np.array([[metres, beside]], np.float32), camera, 1.0)
-        for known in ((0.0, 0.0), (0.02, 0.015), (0.8, 0.015)):
-            terrain = terrain_of(image, STATED, up, known, Config())
-            assert not terrain.stand.found and not (terrain.classes == GROUND).any()

@@ -1,0 +1,30 @@
+"""Ground, edges and what is on it before a camera, and shares of what is found of them."""
+
+import cv2
+import numpy as np
+
+from rangeseg_ros.core.ground.cells import DROP, GROUND
+from rangeseg_ros.simulation.scenes import Pose
+from rangeseg_ros.simulation.terrain.scene import ALL, FAR, Piece, Terrain, slab
+
+HEIGHT = 1.0
+FLOOR = slab(-3, FAR, 0, 0, ALL)
+
+
+def scene(*pieces, pitch=30, roll=0, yaw=0, height=HEIGHT):
+    return Terrain('', pieces, (FLOOR,), Pose.looking((0, 0, height), yaw, pitch, roll))
+
+
+def drop_of(depth, edge=1.7):
+    return (
+        Piece(slab(-3, edge, 0, 0, ALL), GROUND),
+        Piece(slab(edge, FAR, -depth, -depth, ALL), DROP, depth),
+    )
+
+
+def share(classes, frame, true, called):
+    """Of the pixels of a class, away from its borders and within 3.5 m, those called `called`."""
+    truth = cv2.erode((frame.terrain == true).astype(np.uint8), np.ones((7, 7))) > 0
+    truth &= (frame.crossing if true == DROP else frame.depth / 1000) < 3.5
+    assert truth.mean() > 0.003
+    return (classes[truth] == called).mean()
