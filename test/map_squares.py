@@ -1,9 +1,13 @@
-"""Squares as planes of a map."""
+"""Planes of a map: squares, and what frames show of known planes."""
+
+from types import SimpleNamespace
 
 import numpy as np
 
 from rangeseg_ros.core.description.shapes import Shape
 from rangeseg_ros.core.mapping.map_planes import MapOutline, MapPlane
+from rangeseg_ros.core.mapping.observations import LASTING, RESIDUE
+from rangeseg_ros.core.tracking.plane_errors import from_errors, tangents
 
 
 def plane(number, normal, at, sigma, size=2.0):
@@ -34,4 +38,25 @@ def plane(number, normal, at, sigma, size=2.0):
         age=1.0,
         first_stamp=0,
         last_stamp=10**9,
+    )
+
+
+def observed(random, face, pose, root, lasting=0.0):
+    """A plane in the frame of a camera: `root` times an error that lasts and one that is new."""
+    normal, distance = pose.rotation.T @ face[:3], face[3] + face[:3] @ pose.shift
+    centroid = np.array([0.3, 0.2, 1.0])
+    centroid -= (normal @ centroid + distance) * normal
+    errors = from_errors(tangents(normal[None]), centroid[None])[0] @ root
+    error = np.sqrt(LASTING) * lasting + np.sqrt(1 - LASTING) * random.standard_normal(3)
+    off = np.append(normal, distance) + errors @ error
+    off /= np.linalg.norm(off[:3])
+    return SimpleNamespace(
+        normal=off[:3],
+        distance=off[3],
+        covariance=errors @ errors.T / RESIDUE,
+        centroid=centroid - (off[:3] @ centroid + off[3]) * off[:3],
+        confidence=1.0,
+        rms=0.0,
+        area=1.0,
+        count=1000,
     )

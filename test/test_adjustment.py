@@ -4,13 +4,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from map_squares import observed
 from map_squares import plane as map_plane
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.mapping.adjustment import Adjustment
 from rangeseg_ros.core.mapping.observations import (
-    LASTING,
-    RESIDUE,
     PlaneSet,
     PoseNoise,
     cell_rays,
@@ -22,7 +21,7 @@ from rangeseg_ros.core.mapping.plane_map import Sighting
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.tracking.plane_errors import from_errors, tangents, to_errors
+from rangeseg_ros.core.tracking.plane_errors import tangents, to_errors
 
 FACES = np.array(
     [(0, 0, 1, 0), (0, 0, -1, 2.5), (-1, 0, 0, 3), (1, 0, 0, 3), (0, 1, 0, 2), (0, -1, 0, 2)]
@@ -31,29 +30,8 @@ NOISE = PoseNoise(0.005, np.radians(0.3))
 # As the map has them before.
 START = [map_plane(k + 1, f[:3], -f[:3] * f[3], 0.01) for k, f in enumerate(FACES)]
 IDENTITY = Transform.identity()
-# Of planes as a sensor shows them: direction about two axes, and offset.
-SIGMA = np.array([0.004, 0.004, 0.003])
-
-
-def seen(random, face, pose, lasting):
-    """A plane in the frame of a camera, with an error that lasts and one that is new."""
-    normal = pose.rotation.T @ face[:3]
-    distance = face[3] + face[:3] @ pose.shift
-    centroid = -normal * distance
-    jacobian = from_errors(tangents(normal[None]), centroid[None])[0]
-    error = np.sqrt(LASTING) * lasting + np.sqrt(1 - LASTING) * random.standard_normal(3)
-    off = np.append(normal, distance) + jacobian @ (SIGMA * error)
-    off /= np.linalg.norm(off[:3])
-    return SimpleNamespace(
-        normal=off[:3],
-        distance=off[3],
-        covariance=jacobian @ np.diag(SIGMA**2) @ jacobian.T / RESIDUE,
-        centroid=-off[:3] * off[3],
-        confidence=1.0,
-        rms=0.0,
-        area=1.0,
-        count=1000,
-    )
+# Errors of planes as a sensor shows them: direction about two axes, and offset.
+ROOT = np.diag([0.004, 0.004, 0.003])
 
 
 def sighting(pose, planes, *about):
@@ -62,32 +40,39 @@ def sighting(pose, planes, *about):
     return Sighting(pose, seen, *about, np.zeros((1, 3)))
 
 
-def walked(k, frames):
-    """Pose of a camera that walks 4 m along a room."""
-    turn = Rotation.from_rotvec(0.3 * np.sin([k / 7, k / 9, k / 5])).as_matrix()
-    return Transform(turn, np.array([-2 + 4 * k / frames, 0.3 * np.sin(k / 5), 1.2]))
+def walked(frames):
+    """Poses of a camera that walks 4 m along a room."""
+    k = np.arange(frames)
+    turns = Rotation.from_rotvec(0.3 * np.sin(k[:, None] / [7, 9, 5])).as_matrix()
+    places = np.stack([-2 + 4 * k / frames, 0.3 * np.sin(k / 5), np.full(frames, 1.2)], axis=1)
+    return list(map(Transform, turns, places))
+
+
+def ways(poses):
+    """From each pose to the next one, metres."""
+    return np.linalg.norm(np.diff([pose.shift for pose in poses], axis=0), axis=1)
 
 
 def solved(seed, drift=(0, 0, 0), frames=40, moving=0.0, odometry=False):
     """Solution for a camera that walks along a room, and its true poses."""
-    random = np.random.default_rng(seed)
-    adjustment, truths, way = Adjustment(NOISE, odometry), [], 0.0
-    told_off = np.zeros(3)
-    for k in range(frames):
-        truth = walked(k, frames)
-        way += np.linalg.norm(truth.shift - truths[-1].shift) if truths else 0
-        off = Rotation.from_rotvec(random.normal(0, NOISE.turn, 3)).as_matrix()
-        fresh = random.normal(0, NOISE.shift, 3)
-        told_off = told_off + fresh if odometry else fresh
-        turned = truth.rotation if odometry else off @ truth.rotation
-        told = Transform(turned, truth.shift + told_off + np.array(drift) * way)
+    random, truths = np.random.default_rng(seed), walked(frames)
+    adjustment, errors = (
+        Adjustment(NOISE, odometry),
+        random.normal(0, NOISE.deviations, (frames, 6)),
+    )
+    if odometry:
+        errors = np.cumsum(errors, axis=0) * np.repeat([0, 1], 3)
+    errors[:, 3:] += np.outer(np.append(0, np.cumsum(ways(truths))), drift)
+    for k, (truth, error) in enumerate(zip(truths, errors, strict=True)):
         # All pixels are others after four frames.
         lasting = np.random.default_rng([seed, k // 4]).standard_normal((len(FACES), 3))
-        begins = np.full(len(FACES), k % 4 == 0)
-        faces = FACES + np.outer(np.arange(len(FACES)) == 5, (0, 0, 0, moving * (k > frames / 2)))
-        planes = [seen(random, f, truth, own) for f, own in zip(faces, lasting, strict=True)]
-        adjustment.add(sighting(told, planes, np.arange(1, len(FACES) + 1), begins))
-        truths.append(truth)
+        begins, faces = np.full(len(FACES), k % 4 == 0), FACES.copy()
+        faces[5, 3] += moving * (k > frames / 2)
+        planes = [
+            observed(random, face, truth, ROOT, own)
+            for face, own in zip(faces, lasting, strict=True)
+        ]
+        adjustment.add(sighting(truth.by(error), planes, np.arange(1, len(FACES) + 1), begins))
     return adjustment.solve(START, {}), truths
 
 
@@ -115,8 +100,7 @@ def test_errors_are_as_small_as_stated_and_poses_better_than_told():
             Rotation.from_matrix(a.rotation @ b.rotation.T).magnitude()
             for a, b in zip(solution.poses, truths, strict=True)
         ]
-        way = np.diff([truth.shift for truth in truths], axis=0)
-        assert solution.way == pytest.approx(np.linalg.norm(way, axis=1).sum(), rel=0.015)
+        assert solution.way == pytest.approx(ways(truths).sum(), rel=0.015)
         assert not solution.drifts
     assert 0.7 < np.mean(nees) < 1.5
     assert rms(shifts) < 0.75 * NOISE.shift and rms(turns) < 0.75 * 3**0.5 * NOISE.turn
@@ -153,7 +137,7 @@ def test_observations_count_for_what_their_planes_became():
     adjustment = Adjustment(NOISE)
     pose = Transform(np.eye(3), np.array([0.0, 0.0, 1.0]))
     for number in (1, 7, 9):
-        planes = [seen(random, FACES[0], pose, np.zeros(3))]
+        planes = [observed(random, FACES[0], pose, ROOT)]
         adjustment.add(sighting(pose, planes, np.array([number]), np.array([True])))
     adjustment.add(sighting(pose, [], np.zeros(0, int), np.zeros(0, bool)))
     start = [map_plane(1, (0, 0, 1), (0, 0, 0), 0.01)]
@@ -207,18 +191,15 @@ def test_the_distortion_of_the_sensor_is_told_from_the_planes():
         turn = Rotation.from_rotvec(random.normal(0, 1, 3)).as_matrix()
         truth = Transform(turn, random.uniform((-2, -1, 0.5), (2, 1, 2.0)))
         told = truth.by(random.normal(0, NOISE.deviations))
-        planes, views, ids = [], [], []
-        for number, face in enumerate(FACES, 1):
-            if (truth.rotation.T @ face[:3])[2] < -0.7:
-                view = random.uniform(0.1, 1, 12) * (random.random(12) < 0.8)
-                normal, distance = np.split(distorted(face, truth, view, field), [3])
-                planes.append(seen(random, np.append(normal, distance), IDENTITY, np.zeros(3)))
-                views.append(view)
-                ids.append(number)
-        views, begins = np.reshape(views, (-1, 12)), np.full(len(ids), True)
-        sensed = observations(planes, views, told, NOISE)
+        ids = 1 + np.flatnonzero(FACES[:, :3] @ truth.rotation[:, 2] < -0.7)
+        planes, views = [], random.uniform(0.1, 1, (len(ids), 12))
+        views *= random.random(views.shape) < 0.8
+        for face, view in zip(FACES[ids - 1], views, strict=True):
+            shown = distorted(face, truth, view, field)
+            planes.append(observed(random, shown, IDENTITY, ROOT))
+        about = observations(planes, views, told, NOISE), ids, np.full(len(ids), True)
         for adjustment, rays in zip(adjustments, (RAYS, 0 * RAYS), strict=True):
-            adjustment.add(Sighting(told, sensed, np.array(ids, int), begins, rays.reshape(-1, 3)))
+            adjustment.add(Sighting(told, *about, rays.reshape(-1, 3)))
     for adjustment in adjustments:
         solution = adjustment.solve(START, {})
         off.append([plane.distance for plane in solution.planes] - FACES[:, 3])
@@ -250,20 +231,18 @@ def test_what_a_jump_was_taken_for_wrongly_is_taken_off():
     spread = np.diag(np.repeat([0.03, 0.05], 3) ** 2)
     off = []
     for told_spread in (spread, 1e-6 * spread):
-        random, adjustment, truths = np.random.default_rng(2), Adjustment(NOISE), []
+        random, adjustment, truths = np.random.default_rng(2), Adjustment(NOISE), walked(24)
         turn = Rotation.from_rotvec(wrong[:3]).as_matrix()
         moved = Transform(turn, camera + wrong[3:] - turn @ camera)
-        for k in range(24):
-            truth = walked(k, 24)
+        for k, truth in enumerate(truths):
             told = truth.by(random.normal(0, NOISE.deviations))
             # Most frames before it show floor and ceiling only.
             shown = 6 if k in (0, 9, 17) or k >= 18 else 2
-            planes = [seen(random, f, truth, np.zeros(3)) for f in FACES[:shown]]
+            planes = [observed(random, face, truth, ROOT) for face in FACES[:shown]]
             jump = Jump(IDENTITY, camera, wrong, told_spread) if k == 18 else None
             told = moved.after(told) if k < 18 else told
             now = sighting(told, planes, np.arange(shown) + 1, np.full(shown, True))
             adjustment.add(now._replace(jump=jump))
-            truths.append(truth)
         off.append(errors_of(adjustment.solve(START, {}), truths)[1][:18])
     known, unknown = map(rms, off)
     assert known < 0.01 < unknown / 5
