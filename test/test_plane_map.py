@@ -94,8 +94,7 @@ def test_a_walk_maps_every_face_once_and_better_than_single_frames(seed):
         assert np.degrees(np.arccos(min(1, plane.normal @ face[:3]))) < 1.5
         assert abs(face[:3] @ plane.centroid + face[3]) < 0.03
         assert plane.observations >= 20 and plane.area > 1
-    matched = [sum(on_face(plane, face) for face in truth) for plane in planes]
-    assert min(matched) == 1
+    assert min(sum(on_face(plane, face) for face in truth) for plane in planes) == 1
     ids = [plane.id for plane in planes]
     assert ids == sorted(set(ids)) and {'wall', 'floor'} & {plane.role for plane in planes}
     for plane in planes:
@@ -136,9 +135,8 @@ def test_what_rays_pass_through_is_gone_within_seconds():
     random, plane_map = np.random.default_rng(0), PlaneMap()
     for k in range(12):
         add(plane_map, before, k, random)
-    front = np.array([-1, 0, 0, 1.75])
+    front, count = np.array([-1, 0, 0, 1.75]), len(plane_map)
     assert sum(on_face(plane, front) for plane in plane_map.planes) == 1
-    count = len(plane_map)
     for k in range(12, 32):
         add(plane_map, after, k, random)
     assert not any(on_face(plane, front) for plane in plane_map.planes)
@@ -148,18 +146,24 @@ def test_what_rays_pass_through_is_gone_within_seconds():
     assert shapely.Polygon(floor.hull[:, :2]).contains(shapely.Point(2.3, 0))
 
 
+SCENE, IDENTITY = kinect_room(4, 48, walk), Transform.identity()
+
+
+def show(sequence, k, stamp, width=320, fixed=IDENTITY):
+    """Segment frame `k` of a walk, the fixed frame moved; the ids of the planes of the map."""
+    image, _ = image_and_truth(SCENE, k, camera=kinect_camera(width, width * 3 // 4))
+    sequence.segment(image, stamp, pose=fixed.after(pose_of(SCENE.poses[k])))
+    return {plane.id for plane in sequence.map.planes}
+
+
 @pytest.mark.parametrize('turn', [0.0, 25.0])
 def test_the_map_follows_a_jump_of_the_fixed_frame(turn):
-    scene = kinect_room(4, 48, walk)
     sequence, sizes = SequenceSegmenter(CONFIG), []
     turned = Rotation.from_euler('z', turn, degrees=True).as_matrix()
     jump = Transform(turned, np.array([0.6, -0.5, 0.0]))
     for k in range(0, 48, 4):
-        pose = pose_of(scene.poses[k])
-        pose = jump.after(pose) if k >= 24 else pose
-        image, _ = image_and_truth(scene, k, camera=kinect_camera(320, 240))
-        sequence.segment(image, 10**9 + k * 10**9 // 30, pose=pose)
-        sizes.append(len(sequence.map))
+        ids = show(sequence, k, 10**9 + k * 10**9 // 30, fixed=jump if k >= 24 else IDENTITY)
+        sizes.append(len(ids))
         if k == 20:
             before = {plane.id: plane for plane in sequence.map.planes}
     assert sizes[5] > 3 and sizes[5] <= sizes[-1] <= sizes[5] + 2
@@ -175,9 +179,8 @@ def test_the_map_follows_a_jump_of_the_fixed_frame(turn):
 
 
 def test_a_tread_that_is_taken_for_the_next_is_no_jump():
-    treads = [
-        box((0.28, 3, 0.17 * k), np.eye(3), (1.4 + 0.28 * k, 0, 0.085 * k)) for k in (1, 2, 3, 4)
-    ]
+    sizes = [((0.28, 3, 0.17 * k), (1.4 + 0.28 * k, 0, 0.085 * k)) for k in (1, 2, 3, 4)]
+    treads = [box(size, np.eye(3), at) for size, at in sizes]
     pose = Pose.looking((0, 0, 1.5), 0, 32, 0)
     scene = Scene((half_space((0, 0, 1), (0, 0, 0)), *treads), (pose,) * 8)
     plane_map = PlaneMap()
@@ -186,10 +189,8 @@ def test_a_tread_that_is_taken_for_the_next_is_no_jump():
         face = {plane.label: plane.face for plane in view.planes}
         planes = fit_planes(view.labels, image, SENSOR)
         # In the last frame all that is level has the id of what was one step higher.
-        level = sorted(
-            (p for p in planes if p.normal @ pose.rotation[2] > 0.9),
-            key=lambda p: p.centroid @ pose.rotation[2],
-        )
+        level = [p for p in planes if p.normal @ pose.rotation[2] > 0.9]
+        level.sort(key=lambda p: p.centroid @ pose.rotation[2])
         assert len(level) > 3
         ids = {p.label: face[p.label] + 1 for p in planes}
         if k == 7:
@@ -201,35 +202,18 @@ def test_a_tread_that_is_taken_for_the_next_is_no_jump():
     np.testing.assert_allclose(heights[:4], 0.17 * np.arange(4), atol=0.03)
 
 
-SCENE = kinect_room(4, 40, walk)
-
-
-def seen(k, width=320):
-    """Image and pose of frame `k` of a walk."""
-    image, _ = image_and_truth(SCENE, k, camera=kinect_camera(width, width * 3 // 4))
-    return image, pose_of(SCENE.poses[k])
-
-
-def ids_of(sequence):
-    return {plane.id for plane in sequence.map.planes}
-
-
 def test_a_looped_recording_begins_the_map_anew():
-    sequence, ids, (image, pose) = SequenceSegmenter(CONFIG), [], seen(0)
-    for _ in range(2):
-        for k in range(4):
-            sequence.segment(image, 10**9 + k * 10**8, pose=pose)
-        ids.append(ids_of(sequence))
-    assert len(ids[0]) == len(ids[1]) > 3 and not ids[0] & ids[1]
+    sequence = SequenceSegmenter(CONFIG)
+    ids = [show(sequence, 0, 10**9 + k % 4 * 10**8) for k in range(8)]
+    assert len(ids[3]) == len(ids[7]) > 3 and not ids[3] & ids[7]
     assert sequence.map.begun_anew == 'time has gone back'
 
 
 def test_frames_without_stamps_make_a_map():
     sequence, areas = SequenceSegmenter(CONFIG), []
     for k, times in ((0, 3), (36, 17)):
-        image, pose = seen(k)
         for _ in range(times):
-            sequence.segment(image, 0, pose=pose)
+            show(sequence, k, 0)
         areas.append(sum(plane.area for plane in sequence.map.planes))
     assert len(sequence.map) > 3 and {plane.last_stamp for plane in sequence.map.planes} == {0}
     assert sequence.map.begun_anew == ''
@@ -242,9 +226,7 @@ def test_another_size_of_images_and_parameters_changed_while_running_keep_the_ma
     for n, k in enumerate(range(0, 40, 4)):
         if n == 5:
             sequence.config = Config(min_pixels=200, map_resolution=0.1, distortion_length=20.0)
-        image, pose = seen(k, 320 if n < 5 else 240)
-        sequence.segment(image, 10**9 + k * 10**9 // 30, pose=pose)
-        ids.append(ids_of(sequence))
+        ids.append(show(sequence, k, 10**9 + k * 10**9 // 30, 320 if n < 5 else 240))
     assert 3 < len(ids[4]) <= len(ids[4] & ids[-1]) + 1 and len(ids[-1]) <= len(ids[4]) + 3
     assert sequence.map.begun_anew == ''
     # Another frame is another map.
@@ -297,12 +279,12 @@ def test_a_grid_has_the_area_and_the_outline_of_what_was_seen():
     # A quarter of a cell along the borders.
     assert grid.area == grid.sure_area == pytest.approx(truth, abs=0.25 * grid.side * border)
     (border, inner), (other,) = grid.polygons()
-    areas = [shapely.LinearRing(ring).is_ccw for ring in (border, inner, other)]
-    assert areas == [True, False, True]
+    rings = border, inner, other
+    assert [shapely.LinearRing(ring).is_ccw for ring in rings] == [True, False, True]
+    border, inner, other = (ring @ turn for ring in rings)
     found = shapely.Polygon(border, [inner]).union(shapely.Polygon(other))
     wanted = shapely.Polygon(square, [hole]).union(shapely.Polygon(apart))
-    turned_back = shapely.affinity.rotate(found, -0.6, (0, 0), use_radians=True)
-    assert turned_back.symmetric_difference(wanted).area < 0.05 * truth
+    assert found.symmetric_difference(wanted).area < 0.05 * truth
     # What is looked at in vain is gone after as many looks as it was sure.
     for _ in range(7):
         grid.add(grid.odds > 0, MISS)
