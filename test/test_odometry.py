@@ -27,6 +27,7 @@ from rangeseg_ros.simulation.solids import box, half_space
 CAMERA = kinect_camera(160, 120)
 CONFIG = Config()
 SENSOR = SensorModel.from_config(CONFIG)
+IDENTITY = Transform.identity()
 STEP = 4
 """Frames of a walk, at 30 Hz, from one that is seen to the next."""
 
@@ -48,21 +49,19 @@ def still(seed):
 
 def followed(scene, frames, seed=0):
     """Motions of the camera, and its true poses in the frame of the odometry."""
-    odometry, first = PlaneOdometry(), scene.poses[frames[0]]
-    motions, truths = [], []
+    odometry, motions = PlaneOdometry(), []
+    truths = [Transform(pose.rotation, pose.position) for pose in scene.poses]
     for k in frames:
-        up = first.rotation[2]
-        motions.append(odometry.add(*planes_of(scene, k, seed), 10**9 + k * 10**9 // 30, up))
-        level = motions[0].pose.rotation @ first.rotation.T
-        pose = scene.poses[k]
-        truths.append((level @ pose.rotation, level @ (pose.position - first.position)))
-    return motions, truths
+        seen = *planes_of(scene, k, seed), 10**9 + k * 10**9 // 30
+        motions.append(odometry.add(*seen, truths[0].rotation[2]))
+    level = motions[0].pose.after(truths[0].inverse())
+    return motions, [level.after(truths[k]) for k in frames]
 
 
 def errors_of(motion, truth):
     """Shift (3,) and turn (3,) that a pose is off."""
-    turn = Rotation.from_matrix(truth[0] @ motion.pose.rotation.T).as_rotvec()
-    return np.concatenate([truth[1] - motion.pose.shift, turn])
+    turn = Rotation.from_matrix(truth.rotation @ motion.pose.rotation.T).as_rotvec()
+    return np.concatenate([truth.shift - motion.pose.shift, turn])
 
 
 def test_walks_are_followed_and_the_error_is_known():
@@ -73,8 +72,8 @@ def test_walks_are_followed_and_the_error_is_known():
         error = errors_of(motions[-1], truths[-1])
         values.append(error @ np.linalg.solve(motions[-1].covariance, error) / 6)
         errors.append(np.linalg.norm(error.reshape(2, 3), axis=1))
-        moved = truths[-1][1] - truths[-2][1]
-        speed = truths[-1][0] @ motions[-1].velocity[:3]
+        moved = truths[-1].shift - truths[-2].shift
+        speed = truths[-1].rotation @ motions[-1].velocity[:3]
         assert speed == pytest.approx(moved / (STEP / 30), abs=0.15)
     assert (np.median(errors, axis=0) < (0.02, np.radians(0.8))).all()
     assert 0.1 < np.mean(values) < 2.0
@@ -90,7 +89,7 @@ def test_what_planes_do_not_hold_is_known_less_and_less(walls):
     forward, left, up, roll, pitch, yaw = wide[-1]
     assert up > 0.3 and up > 1.3 * wide[30][2] > 1.6 * wide[15][2]
     # Of the axes of the odometry, x is ten degrees off the first wall's normal.
-    normal = truths[0][0] @ poses[0].rotation.T @ np.array([1.0, 0, 0])
+    normal = truths[0].rotation @ poses[0].rotation.T @ np.array([1.0, 0, 0])
     along = np.sqrt(normal @ motions[-1].covariance[:3, :3] @ normal)
     about = np.sqrt(normal @ motions[-1].covariance[3:, 3:] @ normal)
     assert along < 0.03 and pitch < np.radians(20)
@@ -136,18 +135,17 @@ def outline_of(turn, shift, random):
 
 def told_of_motion(last, now):
     """Error of the pose (6,) of points, and its covariance; both poses are taken to be 0."""
-    prior, pose = np.diag(np.repeat([0.03, 0.05, 1e-9, 1e-9], 3) ** 2), Transform.identity()
-    design, told = now.motion(last, pose, pose, prior)
+    prior = np.diag(np.repeat([0.03, 0.05, 1e-9, 1e-9], 3) ** 2)
+    design, told = now.motion(last, IDENTITY, IDENTITY, prior)
     covariance = np.linalg.inv(design.T @ design + np.linalg.inv(prior))
     return (covariance @ design.T @ told)[:6], covariance[:6, :6]
 
 
 def test_points_at_jump_edges_tell_a_known_motion_as_well_as_is_said():
     random, values, shifts = np.random.default_rng(0), [], []
-    before = Transform.identity()
     for _ in range(30):
         true = random.normal(0, np.repeat([0.02, 0.03], 3))
-        last, now = (outline_of(*pose, random) for pose in (before, before.by(true)))
+        last, now = (outline_of(*pose, random) for pose in (IDENTITY, IDENTITY.by(true)))
         found, covariance = told_of_motion(last, now)
         error = found - true
         shifts.append(np.linalg.norm(error[3:]))
@@ -159,10 +157,9 @@ def test_points_at_jump_edges_tell_a_known_motion_as_well_as_is_said():
 def test_points_without_a_counterpart_move_the_camera_by_less_than_their_share():
     """As of edges that are hidden in the next image, near others: an eighth of all points."""
     random, moved, aside = np.random.default_rng(1), [], np.array([0.03, 0.03, 0.0])
-    before = Transform.identity()
     for _ in range(40):
-        true = before.by(random.normal(0, np.repeat([0, 0.01], 3)))
-        last, now = (outline_of(*pose, random) for pose in (before, true))
+        true = IDENTITY.by(random.normal(0, np.repeat([0, 0.01], 3)))
+        last, now = (outline_of(*pose, random) for pose in (IDENTITY, true))
         hidden = last._replace(points=np.concatenate([last.points, last.points[::8] + aside]))
         shifts = [told_of_motion(points, now)[0][3:] for points in (last, hidden)]
         moved.append(np.linalg.norm(shifts[1] - shifts[0]))
@@ -172,7 +169,7 @@ def test_points_without_a_counterpart_move_the_camera_by_less_than_their_share()
 def test_new_planes_err_as_the_pose_from_which_they_are_seen():
     """What corrects the pose moves them along."""
     draw, odometry, (planes, view) = np.random.default_rng(0), PlaneOdometry(), still(1)
-    seen = observations(planes, view, Transform.identity(), PoseNoise(0.0, 0.0))
+    seen = observations(planes, view, IDENTITY, PoseNoise(0.0, 0.0))
     pose = Transform(Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(), np.array([1.0, -2, 0.5]))
     root = draw.normal(size=(18, 18))
     odometry._covariance = prior = root @ root.T
@@ -191,7 +188,7 @@ def test_edges_are_taken_in_as_a_filter_does():
     prior = root @ root.T / 18
     odometry._covariance = prior.copy()
     edges = SimpleNamespace(motion=lambda last, before, pose, own: (told, values))
-    odometry._align(Transform.identity(), edges)
+    odometry._align(IDENTITY, edges)
     design = np.zeros((5, 18))
     design[:, _POSES] = told
     expected = np.linalg.inv(np.linalg.inv(prior) + design.T @ design)
@@ -201,8 +198,7 @@ def test_edges_are_taken_in_as_a_filter_does():
 
 def test_a_straight_edge_tells_nothing_along_itself_and_few_points_nothing():
     points = np.array([0.0, 0.0, 2.0]) + np.linspace(-0.5, 0.5, 100)[:, None] * [1.0, 0, 0]
-    edge, pose = JumpPoints(points, 0.004), Transform.identity()
-    prior = np.eye(12) * 0.01
+    edge, prior, pose = JumpPoints(points, 0.004), np.eye(12) * 0.01, IDENTITY
     design, _ = edge.motion(edge, pose, pose, prior)
     across = np.abs(design[:, 3:6]).max(axis=0)
     assert across[1] > 10 and across[0] < 1e-6 * across[1] > across[2]
@@ -214,9 +210,9 @@ def test_a_straight_edge_tells_nothing_along_itself_and_few_points_nothing():
     for off, told in ((0.002, True), (0.02, False)):
         beside = JumpPoints(points + np.array([0, off, 0]), 0.004)
         assert bool(edge.motion(beside, pose, pose, 0 * prior)[0].size) == told
-    few = JumpPoints(points[:15], 0.004)
-    assert not few.motion(edge, pose, pose, prior)[0].size
-    assert not edge.motion(JumpPoints.of(None, None, None), pose, pose, prior)[0].size
+    few, none = JumpPoints(points[:15], 0.004), JumpPoints.of(None, None, None)
+    for last, now in ((edge, few), (none, edge)):
+        assert not now.motion(last, pose, pose, prior)[0].size
 
 
 def test_jump_points_are_on_the_near_side():

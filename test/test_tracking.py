@@ -50,6 +50,11 @@ def wall(first, last):
     return slice(0, 80), slice(first, last), WALL
 
 
+LEFT, RIGHT = ((slice(50, 80), slice(a, a + 24), BOX) for a in (10, 120))
+SLIVER = wall(0, 10), GROUND
+NEARER = (*BOX[:3], BOX[3] - 0.4)
+
+
 def test_a_hidden_plane_moves_along_with_the_camera():
     # Over 20 frames the camera turns 20 degrees and comes 0.4 m nearer, so that the equation of
     # the hidden box becomes another one altogether.
@@ -92,11 +97,24 @@ def test_what_moves_by_itself_does_not_move_the_camera():
     assert shifts[2] < shifts[1] < shifts[0] < 0.25 and shifts[2] < 0.06
 
 
-def test_another_plane_in_the_same_pixels_is_new():
+@pytest.mark.parametrize(
+    ('frames', 'numbers'),
+    [
+        # Another plane in the same pixels is new.
+        ([(*STAY, (*MIDDLE, BOX)), (*STAY, (*MIDDLE, NEARER))], [[1, 2, 3, 4], [1, 2, 3, 5]]),
+        # Parts far apart are not renamed.
+        ([(*STAY, LEFT, RIGHT), (*STAY, RIGHT)], [[1, 2, 3, 4, 5], [1, 2, 3, 5]]),
+        # Two bad pairs are not worth more than a sure one: on one surface everything may be
+        # everything. The large part could take the id of the scrap that is gone, and leave its
+        # own to the scrap that is new.
+        ([(wall(0, 15), wall(20, 140)), (wall(145, 160), wall(26, 140))], [[1, 2], [3, 2]]),
+        # A sliver does not give its id to what swallows it.
+        ([SLIVER, (*SLIVER, wall(20, 160)), (wall(0, 160), GROUND)], [[1, 2], [1, 2, 3], [3, 2]]),
+    ],
+)
+def test_ids_of_frames_one_after_the_other(frames, numbers):
     tracker = Tracker()
-    assert ids(tracker, frame(*STAY, (*MIDDLE, BOX))) == [1, 2, 3, 4]
-    nearer = (*BOX[:3], BOX[3] - 0.4)
-    assert ids(tracker, frame(*STAY, (*MIDDLE, nearer))) == [1, 2, 3, 5]
+    assert [ids(tracker, frame(*regions)) for regions in frames] == numbers
 
 
 def test_the_largest_part_keeps_the_id_and_the_parts_theirs():
@@ -129,36 +147,18 @@ def test_a_surface_keeps_its_id_through_its_parts():
 
 def test_surfaces_taken_for_one_come_apart_with_their_ids():
     tracker = Tracker()
-    labels, planes = frame(*STAY)
+    labels, planes = frame(*reversed(STAY))
 
     def surfaces(*groups):
         grouped = [replace(p, surface=g) for p, g in zip(planes, groups, strict=True)]
         return [p.surface for p in tracker.track(labels, grouped, 0)]
 
-    for groups in ([1, 2, 3], [1, 1, 3], [1, 2, 3], [1, 2, 2], [1, 2, 3]):
+    for groups in ([1, 2, 3], [1, 1, 3], [1, 2, 3], [1, 2, 2], [1, 2, 3], [1, 2, 2]):
         assert surfaces(*groups) == groups
-
-
-def test_parts_far_apart_are_not_renamed():
-    left, right = ((slice(50, 80), slice(a, a + 24), BOX) for a in (10, 120))
-    tracker = Tracker()
-    assert ids(tracker, frame(*STAY, left, right)) == [1, 2, 3, 4, 5]
-    assert ids(tracker, frame(*STAY, right)) == [1, 2, 3, 5]
-
-
-def test_two_bad_pairs_are_not_worth_more_than_a_sure_one():
-    # On one surface everything may be everything. The large part could take the id of the scrap
-    # that is gone, and leave its own to the scrap that is new.
-    tracker = Tracker()
-    assert ids(tracker, frame(wall(0, 15), wall(20, 140))) == [1, 2]
-    assert ids(tracker, frame(wall(145, 160), wall(26, 140))) == [3, 2]
-
-
-def test_a_sliver_does_not_give_its_id_to_what_swallows_it():
-    tracker = Tracker()
-    assert ids(tracker, frame(wall(0, 10), GROUND)) == [1, 2]
-    assert ids(tracker, frame(wall(0, 10), GROUND, wall(20, 160))) == [1, 2, 3]
-    assert ids(tracker, frame(wall(0, 160), GROUND)) == [3, 2]
+    # What loses its id to a larger plane that had it before has a new one, of which no other is.
+    assert surfaces(1, 1, 3) == [1, 1, 2] and surfaces(1, 2, 3) == [1, 4, 2]
+    tracker.reset()
+    assert surfaces(1, 2, 3) == [5, 6, 7]
 
 
 @pytest.mark.parametrize('rate', [2, 30, 120])
