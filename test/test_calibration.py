@@ -14,6 +14,7 @@ from rangeseg_ros.core.calibration.calibrate import (
     CalibrationError,
     _blocks,
     _deviation,
+    _settled_weights,
     calibrate,
     without_plane,
 )
@@ -39,23 +40,19 @@ def true_map(scale=0.002):
     return without_plane(field, np.ones(CAMERA.shape, bool))
 
 
-def frames(count, error, seed=0, noise=NOISE, depths=(0.8, 3.0)):
-    """Two slanted planes side by side in each frame, at depths that change: image and labels."""
+def frames(count, error, seed=0, noise=NOISE, rows=60):
+    """Two slanted planes side by side in each frame, at depths that change: labels and image."""
     random = np.random.default_rng(seed)
-    rays = CAMERA.rays.astype(float)
     for _ in range(count):
-        edge = random.integers(25, 55)
         labels = np.ones(CAMERA.shape, np.uint16)
-        labels[:, edge:] = 2
-        inverse = np.zeros(CAMERA.shape)
-        for label in (1, 2):
-            depth = random.uniform(*depths)
-            theta = np.array([*random.uniform(-0.3, 0.3, 2), 1]) / depth
-            inverse[labels == label] = (rays @ theta)[labels == label]
-        wrong = error(inverse) if callable(error) else error
-        measured = inverse + wrong + noise * smooth_field(CAMERA.shape, (1.0, 1.0), random)
-        depth = (1 / np.maximum(measured, 0.05)).astype(np.float32)
-        yield labels, RangeImage.from_depth(depth, CAMERA)
+        labels[:, random.integers(25, 55) :] = 2
+        slopes, depths = random.uniform(-0.3, 0.3, (2, 2)), random.uniform(0.8, 3.0, (2, 1))
+        thetas = np.column_stack([slopes, np.ones(2)]) / depths
+        inverse = (CAMERA.rays * thetas[labels - 1]).sum(axis=2)
+        inverse += error(inverse) if callable(error) else error
+        inverse += noise * smooth_field(CAMERA.shape, (1.0, 1.0), random)
+        labels[rows:] = 0
+        yield labels, RangeImage.from_depth((1 / inverse).astype(np.float32), CAMERA)
 
 
 def rms(image):
@@ -73,6 +70,16 @@ def seen(count, error, **options):
     return concatenate([find_sightings(*frame) for frame in frames(count, error, **options)])
 
 
+def left_of(cells, values, weight):
+    """What the planes leave of values, by weighted least squares."""
+    left = values.copy()
+    for k in range(len(cells.frame)):
+        own = cells.plane() == k
+        root, ray = np.sqrt(weight[own]), cells.ray[own]
+        left[own] -= ray @ np.linalg.lstsq(root[:, None] * ray, root * values[own])[0]
+    return left
+
+
 @pytest.mark.parametrize(('count', 'share'), [(15, 0.4), (40, 0.3)])
 def test_known_field_is_recovered(count, share):
     result = calibrate(seen(count, true_map()), CAMERA.shape, CAMERA)
@@ -84,33 +91,23 @@ def test_known_field_is_recovered(count, share):
 
 
 def test_gauge_is_the_plane_over_what_was_seen():
-    cells = []
-    for labels, image in frames(20, true_map()):
-        labels[45:] = 0
-        cells.append(find_sightings(labels, image))
-    offset = calibrate(concatenate(cells), CAMERA.shape).distortion.offset.astype(float)
+    cells = seen(20, true_map(), rows=45)
+    offset = calibrate(cells, CAMERA.shape).distortion.offset.astype(float)
     assert offset[:45].any() and not offset[46:].any()
     assert most_of_plane(offset) < 1e-6
 
 
 def test_second_coefficient_where_the_range_is_offset():
-    offset = true_map(0.01)
-
-    def range_offset(inverse):
-        return inverse**2 * offset
-
-    result = calibrate(seen(40, range_offset), CAMERA.shape)
-    distortion = result.distortion
-    assert distortion.slope is not None
-    assert rms(distortion.slope.mean()) < 1e-6
-    known = np.ones(CAMERA.shape, bool)
+    offset, known = true_map(0.01), np.ones(CAMERA.shape, bool)
+    cells = seen(40, lambda inverse: inverse**2 * offset)
+    distortion = calibrate(cells, CAMERA.shape).distortion
+    assert abs(distortion.slope.mean()) < 1e-6
     assert most_of_plane(distortion.offset.astype(float)) < 1e-6
     for inverse in (0.45, 0.6, 0.9):
         error = distortion.offset + distortion.slope * (inverse - distortion.reference)
         truth = inverse**2 * offset
-        off = without_plane(error - truth, known)
         # A slope that is the same everywhere scales all planes and stays free.
-        assert rms(off) < 0.5 * rms(truth)
+        assert rms(without_plane(error - truth, known)) < 0.5 * rms(truth)
 
 
 def test_frames_left_out_do_not_weigh_the_others():
@@ -124,11 +121,11 @@ def test_frames_left_out_do_not_weigh_the_others():
 
 
 def test_wrong_regions_do_not_bend_the_field():
-    cells = []
-    for number, (labels, image) in enumerate(frames(40, true_map())):
-        # Two planes taken as one in every fourth frame.
-        wrong = np.ones_like(labels) if number % 4 == 0 else labels
-        cells.append(find_sightings(wrong, image))
+    # Two planes taken as one in every fourth frame.
+    cells = [
+        find_sightings(labels if k % 4 else np.ones_like(labels), image)
+        for k, (labels, image) in enumerate(frames(40, true_map()))
+    ]
     offset = calibrate(concatenate(cells), CAMERA.shape).distortion.offset
     assert rms(offset - true_map()) < 0.3 * rms(true_map())
 
@@ -149,11 +146,7 @@ def test_the_joint_solution_is_the_one_of_least_squares():
     basis = np.stack([np.ones(len(weight)), draw.normal(size=len(weight))])
 
     def derivative(field):
-        left = cells.inverse - (basis * field[:, cells.cell]).sum(axis=0)
-        for k in range(len(cells.frame)):
-            own = cells.plane() == k
-            root, ray = np.sqrt(weight[own]), cells.ray[own]
-            left[own] -= ray @ np.linalg.lstsq(root[:, None] * ray, root * left[own])[0]
+        left = left_of(cells, cells.inverse - (basis * field[:, cells.cell]).sum(axis=0), weight)
         pull = [np.bincount(cells.cell, weight * part * left) for part in basis]
         bent = [_roughness(grid, k) @ part for k, part in enumerate(field)]
         return pull - np.multiply(bent, np.reshape(smoothness, (2, 1)))
@@ -171,16 +164,19 @@ def test_weights_follow_what_planes_leave():
     inverse = cells.inverse + draw.normal(0, np.where(noisy, 0.05, 0.0005))
     cells = cells._replace(inverse=inverse)
     error = draw.normal(0, 0.001, len(inverse))
-    left = inverse - error
-    for k in range(len(cells.frame)):
-        own = cells.plane() == k
-        ray = cells.ray[own]
-        left[own] -= ray @ np.linalg.lstsq(ray, left[own], rcond=None)[0]
+    left = left_of(cells, inverse - error, np.ones(len(inverse)))
     np.testing.assert_allclose(residuals(cells, inverse - error), left, atol=1e-8)
     size = [max(np.median(abs(left[cells.plane() == k])), np.median(abs(left))) for k in range(6)]
     spread = 1.4826 * np.array(size)[cells.plane()]
     expected = (1.4826 * np.median(abs(left)) / spread) ** 2 / (1 + (left / spread / 2.385) ** 2)
     np.testing.assert_allclose(robust_weights(cells, error), expected, rtol=1e-5)
+
+
+def test_weights_settle_to_those_of_the_field():
+    cells, grid = seen(20, true_map()), cell_grid(CAMERA.shape)
+    truth = true_map().reshape(30, 2, 40, 2).mean(axis=(1, 3)).ravel()[cells.cell]
+    known, none = (robust_weights(cells, field) for field in (truth, 0.0))
+    assert rms(_settled_weights(cells, grid) - known) < 0.5 * rms(none - known)
 
 
 def test_deviations_are_those_of_a_jackknife_and_the_bias():
@@ -219,24 +215,15 @@ def test_sightings_are_means_of_cells_inside_a_plane():
     assert (cells.frame.tolist(), cells.frames, len(cells.start)) == ([0, 0], 1, 3)
 
 
-def test_smoothness_does_not_punish_what_is_free():
+def test_roughness_is_of_second_differences_and_of_first_ones_of_a_slope():
     for grid in ((1, 1), (1, 8), (2, 3), (6, 9)):
-        v, u = np.indices(grid).astype(float)
-        for place, free in ((0, 2 * u - v + 3), (1, np.ones(grid))):
-            assert free.ravel() @ _roughness(grid, place) @ free.ravel() == pytest.approx(
-                0, abs=1e-9
-            )
-    offset, slope = (_roughness(u.shape, place) for place in (0, 1))
-
-    def roughness(matrix, field):
-        return field.ravel() @ (matrix @ field.ravel())
-
-    # Second differences: none along rows and columns, 1 in each of 5 x 8 corners, counted twice.
-    assert roughness(offset, u * v) == pytest.approx(2 * 5 * 8)
-    assert roughness(offset, u * u) == pytest.approx(2**2 * 6 * 7)
-    assert roughness(offset, v * v) == pytest.approx(2**2 * 4 * 9)
-    assert roughness(slope, u) == pytest.approx(6 * 8)
-    assert roughness(slope, v) == pytest.approx(5 * 9)
+        field = np.random.default_rng(0).normal(size=grid)
+        down, right = (np.diff(field, axis=axis) for axis in (0, 1))
+        twist = np.diff(down, axis=1)
+        second = np.diff(down, axis=0), np.diff(right, axis=1), twist, twist
+        for place, differences in enumerate((second, (down, right))):
+            found = field.ravel() @ _roughness(grid, place) @ field.ravel()
+            assert found == pytest.approx(sum((part**2).sum() for part in differences), abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -244,11 +231,7 @@ def test_smoothness_does_not_punish_what_is_free():
     [(6, 60, 'too few planes'), (20, 60, 'too few ranges'), (20, 20, 'too few positions')],
 )
 def test_recordings_that_do_not_hold_it_are_refused_with_advice(count, rows, words):
-    cells = []
-    for labels, image in frames(count, true_map()):
-        labels[rows:] = 0
-        cells.append(find_sightings(labels, image))
-    cells = concatenate(cells)
+    cells = seen(count, true_map(), rows=rows)
     if words == 'too few ranges':
         # Head-on, so that slant does not make distances.
         cells = cells._replace(inverse=np.full_like(cells.inverse, 0.5))
@@ -335,31 +318,18 @@ def test_interrupted_run_goes_on_where_it_was(folder, tmp_path, monkeypatch, run
     assert not list(tmp_path.glob('.*'))
 
 
-@pytest.mark.parametrize(
-    ('kind', 'words'),
-    [
-        ('no camera', 'needs --camera'),
-        ('empty', 'neither a bag nor a folder of depth images'),
-        ('foreign output', 'exists already, and is no distortion map'),
-        ('foreign params', 'exists already, not overwritten'),
-        ('few', 'too few planes'),
-    ],
-)
-def test_bad_input_ends_in_one_line_and_writes_nothing(folder, tmp_path, kind, words, refused):
-    output, params = tmp_path / 'map.tiff', tmp_path / 'sensor.yaml'
-    recording, camera = folder / 'depth', ['--camera', folder / 'camera.yaml']
-    if kind == 'no camera':
-        camera = []
-    elif kind in ('empty', 'few'):
-        recording = tmp_path / 'other'
-        recording.mkdir()
-    if kind == 'few':
-        write_image(recording / 'a.png', np.full(CAMERA.shape, 1000, np.uint16))
-    elif kind == 'foreign output':
-        output.write_text('precious')
-    elif kind == 'foreign params':
-        params.write_text('noise: 0.1\n')
-    before = {path: path.read_text() for path in (output, params) if path.exists()}
-    files = '--output', output, '--params', params
-    assert words in refused('calibrate', recording, *camera, *files, '--jobs', 1)
-    assert {path: path.read_text() for path in (output, params) if path.exists()} == before
+def test_bad_input_ends_in_one_line_and_writes_nothing(folder, tmp_path, refused):
+    other, empty, few = (tmp_path / name for name in ('other', 'empty', 'few'))
+    other.write_text('noise: 0.1')
+    empty.mkdir()
+    write_image(few / 'a.png', np.full(CAMERA.shape, 1000, np.uint16))
+    camera, output = ('--camera', folder / 'camera.yaml'), ('--output', tmp_path / 'map.tiff')
+    for words, recording, *options in (
+        ('needs --camera', folder / 'depth', *output),
+        ('neither a bag nor a folder of depth images', empty, *camera, *output),
+        ('exists already, and is no distortion map', folder / 'depth', *camera, '--output', other),
+        ('exists already, not overwritten', folder / 'depth', *camera, *output, '--params', other),
+        ('too few planes', few, *camera, *output),
+    ):
+        assert words in refused('calibrate', recording, *options, '--jobs', 1)
+    assert other.read_text() == 'noise: 0.1' and set(tmp_path.glob('[!.]*')) == {other, empty, few}
