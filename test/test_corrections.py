@@ -30,35 +30,24 @@ def wall():
     return (CAMERA.rays.astype(float) @ [0.1, -0.2, 0.5]).astype(np.float32)
 
 
-def test_map_is_subtracted_from_inverse_depth():
-    seen = wall() + smooth_map()
-    seen[5, 6], seen[7, 8] = 0, 0.002  # what lies beyond infinity was not measured, either
-    depth = np.divide(1, seen, out=np.zeros_like(seen), where=seen > 0)
+@pytest.mark.parametrize(('slope', 'reference'), [(0.0, 0.0), (0.1, 0.0), (0.1, 0.4)])
+def test_the_error_of_the_inverse_depth_is_taken_off(slope, reference):
+    """Of depth images and along the rays of clouds; what is then beyond infinity is unknown."""
+    inverse = wall()
+    inverse[5, 6], inverse[7, 8] = 0, 0.002
+    bent = np.full(CAMERA.shape, slope, np.float32) if slope else None
+    distortion = DistortionMap(smooth_map(), None, bent, CAMERA, reference)
+    expected = inverse - smooth_map() - slope * (inverse - reference)
+    expected[(inverse == 0) | (expected < 0)] = 0
+    assert expected[5, 6] == 0 and (expected[7, 8] == 0) == (reference == 0)
+    depth = np.divide(1, inverse, out=np.zeros_like(inverse), where=inverse > 0)
     image = RangeImage.from_depth(depth, CAMERA)
-    found = DistortionMap(smooth_map(), camera=CAMERA).corrected(image)
-    expected = wall()
-    expected[5, 6] = expected[7, 8] = 0
+    found, cloud = map(distortion.corrected, (image, cloud_of(image.points)))
     assert found.inverse == pytest.approx(expected, abs=1e-6)
     assert found.corrected and not image.corrected
-
-
-def test_clouds_are_corrected_along_their_rays():
-    true = CAMERA.rays / wall()[..., None]
-    seen = CAMERA.rays / (wall() + smooth_map())[..., None]
-    seen[3, 4] = np.nan
-    image = DistortionMap(smooth_map()).corrected(cloud_of(seen))
-    valid = image.valid
-    assert valid.sum() == valid.size - 1
-    assert image.points[valid] == pytest.approx(true[valid], rel=1e-5)
-
-
-def test_slope_is_the_coefficient_of_the_inverse_depth():
-    slope = np.full(CAMERA.shape, 0.1, np.float32)
-    image = RangeImage.from_depth((1 / wall()).astype(np.float32), CAMERA)
-    for reference in (0.0, 0.4):
-        found = DistortionMap(smooth_map(), None, slope, None, reference).corrected(image)
-        error = smooth_map() + 0.1 * (wall() - reference)
-        assert found.inverse == pytest.approx(wall() - error, abs=1e-6)
+    true = CAMERA.rays[expected > 0] / expected[expected > 0, None]
+    np.testing.assert_array_equal(cloud.valid, expected > 0)
+    assert cloud.points[cloud.valid] == pytest.approx(true, rel=1e-5)
 
 
 def test_size_and_camera_are_checked():
@@ -113,17 +102,13 @@ def test_slope_has_one_page(tmp_path):
             read_distortion(path)
 
 
-def test_maps_of_other_programs_are_read(tmp_path):
+def test_a_changed_file_is_read_again(tmp_path):
+    """In place of one of another program, which says nothing of the camera."""
     path = tmp_path / 'map.tiff'
     cv2.imwrite(str(path), smooth_map())
-    read = read_distortion(path)
+    read = load_distortion(path)
     assert np.array_equal(read.offset, smooth_map()) and read.camera is None
-
-
-def test_a_changed_file_is_read_again(tmp_path):
-    path = tmp_path / 'map.tiff'
-    write_distortion(path, DistortionMap(smooth_map()))
-    assert load_distortion(path) is load_distortion(path)
+    assert load_distortion(path) is read
     write_distortion(path, DistortionMap(smooth_map(0.02)))
     assert np.array_equal(load_distortion(path).offset, smooth_map(0.02))
 

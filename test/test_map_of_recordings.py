@@ -1,11 +1,11 @@
 """From a recording with tf to the map of planes: every format, poses in files, the command."""
 
-import csv
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from recordings import EARLY_TF, SUFFIXES, TF, Recording
+from replays import rows_of
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import Camera
@@ -18,20 +18,17 @@ from rangeseg_ros.io.tables import parts_value
 from rangeseg_ros.io.transforms import RecordedTransforms
 from rangeseg_ros.simulation.scenes import OPTICAL_IN_BODY
 
-FRAMES, STEP = 6, 0.05
-FOCAL, WIDTH, HEIGHT = 50.0, 64, 48
-WALL, ABOVE = 2.0, 1.0
+FRAMES, STEP, WALL, ABOVE = 6, 0.05, 2.0, 1.0
+CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
 # Optical axes, 35 degrees down, in a frame with x forward and z up.
 OPTICAL = Rotation.from_euler('y', 35, degrees=True) * Rotation.from_matrix(OPTICAL_IN_BODY)
 
 
 def depth(k):
     """Of a wall at x = WALL and the ground at z = 0, STEP nearer to the wall every time."""
-    v, u = np.mgrid[:HEIGHT, :WIDTH]
-    rays = np.stack([(u - 31.5) / FOCAL, (v - 23.5) / FOCAL, np.ones(u.shape)], axis=-1)
-    ahead, _, up = np.moveaxis(rays @ OPTICAL.as_matrix().T, -1, 0)
-    ground = np.where(up < 0, -ABOVE / np.minimum(up, -1e-9), np.inf)
-    return np.round(1000 * np.minimum(ground, (WALL - STEP * k) / ahead)).astype(np.uint16)
+    ahead, _, up = np.moveaxis(CAMERA.rays @ OPTICAL.as_matrix().T, -1, 0)
+    inverse = np.maximum(-up / ABOVE, ahead / (WALL - STEP * k))
+    return np.round(1000 / inverse).astype(np.uint16)
 
 
 @pytest.mark.parametrize(
@@ -61,17 +58,11 @@ def test_tf_of_any_recording_places_the_planes(tmp_path, run, storage, kind):
     assert (code, error) == (0, '')
     # No note of frames whose place is not known.
     assert told.splitlines()[1:] == [f'{out}: {FRAMES} frames, 2 planes in the map']
-    with (out / 'map.csv').open() as file:
-        rows = list(csv.DictReader(file))
-    found = {
-        tuple(round(float(row[f'normal_{axis}']), 1) + 0.0 for axis in 'xyz'): row for row in rows
-    }
-    assert set(found) == {(-1, 0, 0), (0, 0, 1)}
-    wall, ground = found[-1, 0, 0], found[0, 0, 1]
-    assert float(wall['distance']) == pytest.approx(WALL, abs=0.02)
-    assert float(ground['distance']) == pytest.approx(0, abs=0.02)
-    assert wall['role'] == 'wall' and ground['role'] == 'floor'
-    for row in rows:
+    rows = sorted(rows_of(out / 'map.csv'), key=lambda row: row['role'])
+    assert [row['role'] for row in rows] == ['floor', 'wall']
+    for row, equation in zip(rows, ((0, 0, 1, 0), (-1, 0, 0, WALL)), strict=True):
+        names = 'normal_x', 'normal_y', 'normal_z', 'distance'
+        assert [float(row[name]) for name in names] == pytest.approx(equation, abs=0.02)
         assert int(row['observations']) == FRAMES
         parts = [part.split('|') for part in row['parts'].split('||')]
         assert parts[0] == [row['hull'], *filter(None, row['holes'].split('|'))]
@@ -93,7 +84,7 @@ def poses(tmp_path):
 def pack(tmp_path, run, poses):
     """Pack images with their poses: the bag, and what is said."""
     camera, images, bag = (tmp_path / name for name in ('camera.yaml', 'images', 'bag'))
-    write_camera(camera, Camera(WIDTH, HEIGHT, FOCAL, FOCAL, 31.5, 23.5))
+    write_camera(camera, CAMERA)
     for k in range(FRAMES):
         write_image(images / f'frame-{k:06d}.depth.png', depth(k))
 
