@@ -53,9 +53,9 @@ def polygon_area(ring, normal):
 
 @pytest.mark.parametrize('degrees', range(0, 180, 20))
 def test_the_length_points_to_the_right_of_the_image(degrees):
-    corners = cv2.boxPoints(((320, 240), (180, 60), degrees)).round().astype(int)
+    corners = cv2.boxPoints(((320, 240), (180, 40), degrees)).round().astype(int)
     labels = cv2.fillPoly(np.zeros(CAMERA.shape, np.uint8), [corners], 1)
-    (plane,) = fit_planes(labels.astype(np.uint16), plane_image(), KINECT)
+    (plane,) = fit_planes(labels.astype(np.uint16), plane_image((0.48, -0.6, -0.64)), KINECT)
     assert plane.shape.frame[0, 0] > 0 and plane.extents[0] > 2 * plane.extents[1]
 
 
