@@ -144,17 +144,13 @@ def robot_on_a_floor():
     return np.round(1000 * np.minimum(depth, 60)).astype(np.uint16)
 
 
-def parameters(path):
-    up = dict(zip(('up_x', 'up_y', 'up_z'), map(float, UP), strict=True))
-    return {**up, 'sensor_height': 1.0, 'mask': str(path)}
-
-
 @pytest.mark.parametrize('channels', [1, 3, 4])
 def test_the_body_is_left_out(tmp_path, channels):
     path = tmp_path / 'mask.png'
     picture = BODY if channels == 1 else np.dstack([BODY] * channels)
     cv2.imwrite(str(path), picture)
-    config = Config(**parameters(path))
+    up = dict(zip(('up_x', 'up_y', 'up_z'), UP.tolist(), strict=True))
+    config = Config(**up, sensor_height=1.0, mask=str(path))
     image = RangeImage.from_depth(robot_on_a_floor(), VIEW)
     with pytest.raises(RangeImageError, match=r'corrected\(image, config\)'):
         Segmenter(config).segment(image)
