@@ -4,8 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from map_squares import observed
-from map_squares import plane as map_plane
+from map_squares import observed, plane
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.mapping.adjustment import Adjustment
@@ -28,7 +27,7 @@ FACES = np.array(
 )
 NOISE = PoseNoise(0.005, np.radians(0.3))
 # As the map has them before.
-START = [map_plane(k + 1, f[:3], -f[:3] * f[3], 0.01) for k, f in enumerate(FACES)]
+START = [plane(k + 1, f[:3], -f[:3] * f[3], 0.01) for k, f in enumerate(FACES)]
 IDENTITY = Transform.identity()
 # Errors of planes as a sensor shows them: direction about two axes, and offset.
 ROOT = np.diag([0.004, 0.004, 0.003])
@@ -134,7 +133,7 @@ def test_observations_count_for_what_their_planes_became():
         planes = [observed(random, FACES[0], pose, ROOT)]
         adjustment.add(sighting(pose, planes, np.array([number]), np.array([True])))
     adjustment.add(sighting(pose, [], np.zeros(0, int), np.zeros(0, bool)))
-    start = [map_plane(1, (0, 0, 1), (0, 0, 0), 0.01)]
+    start = [plane(1, (0, 0, 1), (0, 0, 0), 0.01)]
     with_one = adjustment.solve(start, {}).covariance
     with_two = adjustment.solve(start, {9: 7, 7: 1}).covariance
     assert np.trace(with_two) < 0.7 * np.trace(with_one)

@@ -40,10 +40,13 @@ def true_map(scale=0.002):
     return without_plane(field, np.ones(CAMERA.shape, bool))
 
 
-def frames(count, error, seed=0, noise=NOISE, rows=60):
-    """Two slanted planes side by side in each frame, at depths that change: labels and image."""
+def frames(count, error, seed=0, noise=NOISE, rows=60, wrong=0):
+    """Two slanted planes side by side in each frame, at depths that change: labels and image.
+
+    The upper rows have labels, which of some frames, each so many, take both planes for one.
+    """
     random = np.random.default_rng(seed)
-    for _ in range(count):
+    for k in range(count):
         labels = np.ones(CAMERA.shape, np.uint16)
         labels[:, random.integers(25, 55) :] = 2
         slopes, depths = random.uniform(-0.3, 0.3, (2, 2)), random.uniform(0.8, 3.0, (2, 1))
@@ -51,19 +54,14 @@ def frames(count, error, seed=0, noise=NOISE, rows=60):
         inverse = (CAMERA.rays * thetas[labels - 1]).sum(axis=2)
         inverse += error(inverse) if callable(error) else error
         inverse += noise * smooth_field(CAMERA.shape, (1.0, 1.0), random)
+        if wrong and k % wrong == 0:
+            labels[:] = 1
         labels[rows:] = 0
         yield labels, RangeImage.from_depth((1 / inverse).astype(np.float32), CAMERA)
 
 
 def rms(image):
     return float(np.sqrt((image**2).mean()))
-
-
-def most_of_plane(field):
-    """Largest value of the plane that is nearest to the known values of a field."""
-    v, u = np.nonzero(field)
-    terms = np.stack([u, v, np.ones(len(u))], axis=1)
-    return np.abs(terms @ np.linalg.lstsq(terms, field[v, u], rcond=None)[0]).max()
 
 
 def seen(count, error, **options):
@@ -80,24 +78,25 @@ def left_of(cells, values, weight):
     return left
 
 
-@pytest.mark.parametrize(('count', 'share'), [(15, 0.4), (40, 0.3)])
-def test_known_field_is_recovered(count, share):
-    result = calibrate(seen(count, true_map()), CAMERA.shape, CAMERA)
+@pytest.mark.parametrize(('count', 'wrong', 'share'), [(15, 0, 0.4), (40, 0, 0.3), (40, 4, 0.3)])
+def test_known_field_is_recovered(count, wrong, share):
+    result = calibrate(seen(count, true_map(), wrong=wrong), CAMERA.shape, CAMERA)
     off = rms(result.distortion.offset - true_map())
     assert off < share * rms(true_map())
     # As uncertain as it says, within what five blocks tell.
     assert 0.3 < off / rms(result.distortion.deviation) < 3
-    assert result.after < 0.85 * result.before
+    assert wrong or result.after < 0.85 * result.before
 
 
 def test_second_coefficient_where_the_range_is_offset():
     offset, known = true_map(0.01), np.indices(CAMERA.shape)[0] < 46
     cells = seen(40, lambda inverse: inverse**2 * offset, rows=46)
     distortion = calibrate(cells, CAMERA.shape).distortion
+    moments = [distortion.offset * part for part in (1, *np.indices(CAMERA.shape))]
     # Of what was not seen nothing is told; the rest has no plane in it.
     assert distortion.offset[:44].any() and not distortion.offset[46:].any()
     assert abs(distortion.slope.mean()) < 1e-6
-    assert most_of_plane(distortion.offset.astype(float)) < 1e-6
+    assert abs(np.mean(moments, axis=(1, 2))).max() < 1e-6
     for inverse in (0.45, 0.6, 0.9):
         error = distortion.offset + distortion.slope * (inverse - distortion.reference)
         truth = inverse**2 * offset
@@ -114,16 +113,6 @@ def test_frames_left_out_do_not_weigh_the_others():
     one, two = (_blocks(each, cell_grid(CAMERA.shape)) for each in (cells, other))
     assert np.array_equal(one[0][1], two[0][1])
     assert not np.array_equal(one[1][1], two[1][1])
-
-
-def test_wrong_regions_do_not_bend_the_field():
-    # Two planes taken as one in every fourth frame.
-    cells = [
-        find_sightings(labels if k % 4 else np.ones_like(labels), image)
-        for k, (labels, image) in enumerate(frames(40, true_map()))
-    ]
-    offset = calibrate(concatenate(cells), CAMERA.shape).distortion.offset
-    assert rms(offset - true_map()) < 0.3 * rms(true_map())
 
 
 @pytest.mark.parametrize('seed', [0, 1])
@@ -266,22 +255,17 @@ def test_the_true_map_takes_the_residuals_away(folder):
 def test_command_writes_map_parameters_and_report(folder, tmp_path, run):
     output, params = tmp_path / 'map.tiff', tmp_path / 'sensor.yaml'
     camera = ['--camera', folder / 'camera.yaml', '--jobs', 1]
-    code, said, error = run(
-        'calibrate', folder / 'depth', *camera, '--output', output, '--params', params
-    )
-    assert code == 0, error
-    assert 'less' in said
+    files = '--output', output, '--params', params
+    code, said, error = run('calibrate', folder / 'depth', *camera, *files)
+    assert code == 0 and 'less' in said, error
     distortion = read_distortion(output)
     assert distortion.camera == CAMERA
     assert rms(distortion.offset - true_map(0.004)) < 0.4 * rms(true_map(0.004))
-    values = yaml.safe_load(params.read_text())
-    assert values['distortion_map'] == str(output)
-    assert Config(**values).distortion_map == str(output)
+    assert Config(**yaml.safe_load(params.read_text())).distortion_map == str(output)
     page = (tmp_path / 'map_report.html').read_text()
     assert 'before' in page and page.count('data:image/svg') >= 3
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        'map.tiff', 'map_report.html', 'sensor.yaml',
-    ]  # fmt: skip
+    written = {path.name for path in tmp_path.iterdir()}
+    assert written == {'map.tiff', 'map_report.html', 'sensor.yaml'}
 
     # The same from a bag, in place of the one before. Points tell the camera that took them.
     code, _, error = run('calibrate', folder / 'bag', '--output', output, '--jobs', 1)

@@ -36,19 +36,16 @@ def depth(k):
 )
 def test_tf_of_any_recording_places_the_planes(tmp_path, run, storage, kind):
     recording = Recording(ros1=storage == 'rosbag1')
-    recording.add_transform(
-        10**18, 'base_link', 'optical', OPTICAL.as_quat(), (0, 0, ABOVE), kind, static=True
-    )
+    mount = 'base_link', 'optical', OPTICAL.as_quat(), (0, 0, ABOVE)
+    recording.add_transform(10**18, *mount, kind, static=True)
     for k in range(FRAMES):
         stamp = 10**18 + k * 10**8
         recording.add_camera(stamp)
         recording.add_image(stamp, depth(k))
         # Between samples, so that they are interpolated.
         for after in (-20_000_000, 20_000_000):
-            x = STEP * (k + after * 1e-8)
-            recording.add_transform(
-                stamp + after, 'odom', 'base_link', (0, 0, 0, 1), (x, 0, 0), kind
-            )
+            place = (0, 0, 0, 1), (STEP * (k + after * 1e-8), 0, 0)
+            recording.add_transform(stamp + after, 'odom', 'base_link', *place, kind)
     recording.messages.sort(key=lambda message: message[0])
     path, out, params = (tmp_path / name for name in (f'a{SUFFIXES[storage]}', 'out', 'p.yaml'))
     recording.write(path, storage)
@@ -142,11 +139,8 @@ def test_poses_are_found_by_stem_or_else_by_number(tmp_path):
         (tmp_path / name).write_text('')
     images = [tmp_path / name for name in ('a1.png', 'b2.png', 'frame3.depth.tiff', 'frame4.png')]
     found = match_poses(images, tmp_path)
-    assert {i.name: p.name for i, p in found.items()} == {
-        'a1.png': 'a1.txt',
-        'b2.png': 'b2.pose.txt',
-        'frame3.depth.tiff': 'pose_0003.txt',
-    }
+    names = 'a1.txt', 'b2.pose.txt', 'pose_0003.txt'
+    assert found == {i: tmp_path / name for i, name in zip(images[:3], names, strict=True)}
     (tmp_path / 'other-3.txt').write_text('')
     with pytest.raises(FileError, match=r'may belong to other-3.txt or pose_0003.txt'):
         match_poses(images, tmp_path)
