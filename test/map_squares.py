@@ -13,9 +13,7 @@ from rangeseg_ros.core.tracking.plane_errors import from_errors, tangents
 def plane(number, normal, at, sigma, size=2.0):
     """A square of a plane around a point, whose direction is known to `sigma` radians."""
     normal = np.array(normal, float) / np.linalg.norm(normal)
-    along = np.cross(normal, np.eye(3)[np.argmin(abs(normal))])
-    along /= np.linalg.norm(along)
-    axes = np.stack([along, np.cross(normal, along)])
+    axes = tangents(normal[None])[0]
     corners = at + size / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ axes
     jacobian = np.block([[axes.T, np.zeros((3, 1))], [-axes @ at, 1]])
     covariance = jacobian @ np.diag([sigma**2, sigma**2, 1e-6]) @ jacobian.T

@@ -18,6 +18,8 @@ from rangeseg_ros.io.distortion import KIND, read_distortion, write_distortion
 from rangeseg_ros.io.images import read_mask
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+WALL = (CAMERA.rays.astype(float) @ [0.1, -0.2, 0.5]).astype(np.float32)
+"""Inverse depth of a slanted wall."""
 
 
 def smooth_map(scale=0.01):
@@ -25,15 +27,10 @@ def smooth_map(scale=0.01):
     return (scale * np.sin(u / 9) * np.cos(v / 7)).astype(np.float32)
 
 
-def wall():
-    """A slanted wall: true inverse depth."""
-    return (CAMERA.rays.astype(float) @ [0.1, -0.2, 0.5]).astype(np.float32)
-
-
 @pytest.mark.parametrize(('slope', 'reference'), [(0.0, 0.0), (0.1, 0.0), (0.1, 0.4)])
 def test_the_error_of_the_inverse_depth_is_taken_off(slope, reference):
     """Of depth images and along the rays of clouds; what is then beyond infinity is unknown."""
-    inverse = wall()
+    inverse = WALL.copy()
     inverse[5, 6], inverse[7, 8] = 0, 0.002
     bent = np.full(CAMERA.shape, slope, np.float32) if slope else None
     distortion = DistortionMap(smooth_map(), None, bent, CAMERA, reference)
@@ -63,7 +60,7 @@ def test_size_and_camera_are_checked():
 def test_segmenter_does_not_forget_the_map(tmp_path):
     write_distortion(tmp_path / 'map.tiff', DistortionMap(smooth_map()))
     config = Config(distortion_map=str(tmp_path / 'map.tiff'), min_pixels=50)
-    seen = (1 / (wall() + smooth_map())).astype(np.float32)
+    seen = (1 / (WALL + smooth_map())).astype(np.float32)
     image = RangeImage.from_depth(seen, CAMERA)
     with pytest.raises(RangeImageError, match=r'corrected\(image, config\)'):
         Segmenter(config).segment(image)
@@ -170,13 +167,10 @@ def test_of_four_channels_the_last_is_opacity(tmp_path):
     assert read_mask(tmp_path / 'mask.png').tolist() == expected
 
 
-@pytest.mark.parametrize(
-    ('option', 'kind'),
-    [
-        *(('mask', kind) for kind in ('missing', 'text', 'size')),
-        *(('distortion_map', kind) for kind in ('missing', 'text', 'nan', 'integers')),
-    ],
-)
+WRONG = {'mask': 'missing text size', 'distortion_map': 'missing text nan integers'}
+
+
+@pytest.mark.parametrize(('option', 'kind'), [(o, k) for o in WRONG for k in WRONG[o].split()])
 def test_wrong_files_end_the_command_in_one_line(tmp_path, option, kind, segment_image):
     path = tmp_path / 'file.tiff'
     if kind == 'text':

@@ -71,25 +71,19 @@ FRAME = 'camera_depth_optical_frame'
 
 
 @pytest.fixture
-def poses(tmp_path):
-    """Folder of poses, empty."""
-    (tmp_path / 'poses').mkdir()
-    return tmp_path / 'poses'
-
-
-@pytest.fixture
-def pack(tmp_path, run, poses):
-    """Pack images with their poses: the bag, and what is said."""
-    camera, images, bag = (tmp_path / name for name in ('camera.yaml', 'images', 'bag'))
+def pack(tmp_path, run):
+    """Pack images with the poses in a folder: the bag, and what is said."""
+    camera, images, poses = (tmp_path / name for name in ('camera.yaml', 'images', 'poses'))
+    poses.mkdir()
     write_camera(camera, CAMERA)
     for k in range(FRAMES):
         write_image(images / f'frame-{k:06d}.depth.png', depth(k))
 
     def run_command(*options):
-        files = '--camera', camera, '--poses', poses, '--output', bag
+        files = '--camera', camera, '--poses', poses, '--output', tmp_path / 'bag'
         code, output, error = run('pack', images, *files, *options)
         assert code == 0, error
-        return bag, output
+        return tmp_path / 'bag', output
 
     return run_command
 
@@ -101,9 +95,10 @@ def some_pose(k):
     return pose
 
 
-def test_poses_become_transforms_at_the_stamps_of_their_images(poses, pack):
+def test_poses_become_transforms_at_the_stamps_of_their_images(tmp_path, pack):
     for k in range(5):
-        np.savetxt(poses / f'frame-{k}.pose.txt', some_pose(k), delimiter=', ' if k % 2 else ' ')
+        path = tmp_path / f'poses/frame-{k}.pose.txt'
+        np.savetxt(path, some_pose(k), delimiter=', ' if k % 2 else ' ')
     bag, output = pack('--rate', '10')
     told = '5 poses, 1 without: no pose for frame-000005.depth.png'
     assert output.splitlines()[-2:] == [f'{bag}: 6 images', told]
@@ -118,14 +113,14 @@ def test_poses_become_transforms_at_the_stamps_of_their_images(poses, pack):
                 transforms.lookup('world', FRAME, stamp + 5 * 10**7, stamp)
 
 
-def test_what_is_missing_or_no_pose_is_counted_and_said(poses, pack):
+def test_what_is_missing_or_no_pose_is_counted_and_said(tmp_path, pack):
     values = [some_pose(k) for k in range(6)]
     values[1][0, 0] = np.nan
     values[2][:3, :3] *= 1.5
     values[3][:3, 0] *= -1
     for k in (0, 1, 2, 3):
-        np.savetxt(poses / f'{k}.txt', values[k])
-    (poses / '4.txt').write_text('1 2 three')
+        np.savetxt(tmp_path / f'poses/{k}.txt', values[k])
+    (tmp_path / 'poses/4.txt').write_text('1 2 three')
     bag, output = pack()
     assert '1 poses, 5 without: 1.txt: values are not finite, and 4 more' in output
     with RecordedTransforms(bag, timeout=1.0) as transforms:

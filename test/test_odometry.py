@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from message_classes import header, make_rosbags
 from planes_of_labels import fit_planes
 from recordings import Recording
 from scipy.spatial.transform import Rotation
@@ -17,7 +18,6 @@ from rangeseg_ros.core.mapping.odometry import _POSES, PlaneOdometry
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import SequenceSegmenter
-from rangeseg_ros.io.recordings import make_rosbags
 from rangeseg_ros.messages.motion import odometry_message
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import Pose, Scene, kinect_room, walk
@@ -257,11 +257,9 @@ def test_stamps_that_do_not_tell_and_gaps_are_no_trouble():
 
 def test_the_message_has_pose_and_twist_in_their_frames():
     motion = PlaneOdometry().add(*still(2), 10**9, (0, -1, 0))
-    stamp = make_rosbags('builtin_interfaces/msg/Time', sec=1, nanosec=2)
-    header = make_rosbags('std_msgs/msg/Header', stamp=stamp, frame_id='camera')
-    message = odometry_message(make_rosbags, header, motion)
-    assert message.header.frame_id == 'odom' and message.header.stamp == stamp
-    assert message.child_frame_id == 'camera'
+    message = odometry_message(make_rosbags, header(), motion)
+    assert message.header.frame_id == 'odom' and message.header.stamp == header().stamp
+    assert message.child_frame_id == header().frame_id
     turn = message.pose.pose.orientation
     found = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
     np.testing.assert_allclose(found, motion.pose.rotation, atol=1e-12)

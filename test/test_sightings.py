@@ -83,14 +83,12 @@ def test_cells_are_seen_where_pixels_of_the_plane_look_at_them():
     off = Rotation.from_rotvec([0.02, 0.01, 0]).apply(normal[0])
     points = known.points(grid.centres())
     points -= (points @ off + 2.4)[:, None] * off
-    x, y, z = points.T
-    column = np.rint(CAMERA.fx * x / z + CAMERA.cx).astype(int)
-    row = np.rint(CAMERA.fy * y / z + CAMERA.cy).astype(int)
-    inside = (row >= 0) & (column >= 0) & (row < CAMERA.height) & (column < CAMERA.width)
-    truth = np.where(inside, labels[row * inside, column * inside], 0)
+    pixels = np.rint(points @ CAMERA.matrix.T / points[:, 2:]).astype(int)[:, 1::-1]
+    # Beside the image there are no labels.
+    truth = np.pad(labels, 1)[tuple(np.clip(pixels + 1, 0, np.add(CAMERA.shape, 1)).T)]
     for turn, camera in ((np.eye(3), CAMERA), (BODY.axes, BODY)):
         seen = SimpleNamespace(normal=turn @ off, distance=2.4, label=2)
         moved = known.moved(Transform(turn, np.zeros(3)))
         found = seen_cells(grid, moved, seen, labels, camera)[grid.odds > 0]
         # Of some, the border of a pixel looks at the centre.
-        assert (found == (truth == 2))[z > 0.1].mean() > 0.98
+        assert (found == (truth == 2))[points[:, 2] > 0.1].mean() > 0.98
