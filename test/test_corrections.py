@@ -144,8 +144,7 @@ def robot_on_a_floor():
 @pytest.mark.parametrize('channels', [1, 3, 4])
 def test_the_body_is_left_out(tmp_path, channels):
     path = tmp_path / 'mask.png'
-    picture = BODY if channels == 1 else np.dstack([BODY] * channels)
-    cv2.imwrite(str(path), picture)
+    cv2.imwrite(str(path), np.dstack([BODY] * channels))
     up = dict(zip(('up_x', 'up_y', 'up_z'), UP.tolist(), strict=True))
     config = Config(**up, sensor_height=1.0, mask=str(path))
     image = RangeImage.from_depth(robot_on_a_floor(), VIEW)

@@ -109,15 +109,12 @@ def test_parts_that_turn_out_to_be_one_surface_become_one_plane():
     pose = Pose.looking((0, 0, 1.2), 0, 0, 0)
     image, view = image_and_truth(Scene((half_space((-1, 0, 0), (2.5, 0, 0)),), (pose,)))
     labels = view.labels.copy()
-    middle = labels.shape[1] // 2
-    labels[:, middle:] *= 2
-    labels[:, middle - 4 : middle + 4] = 0
+    labels[:, 80:] *= 2
+    labels[:, 76:84] = 0
     parts, plane_map, counts = fit_planes(labels, image, SENSOR), PlaneMap(), []
     for k in range(8):
-        planes = [
-            replace(plane, id=10 * k + plane.label, surface=plane.label if k < 4 else 1)
-            for plane in parts[: k + 1]
-        ]
+        named = ((part, part.label if k < 4 else 1) for part in parts[: k + 1])
+        planes = [replace(part, id=10 * k + part.label, surface=own) for part, own in named]
         plane_map.add(labels, planes, image, pose_of(pose), 10**9 + k * 10**8)
         counts.append(len(plane_map))
     # Not what a frame finds on two surfaces, though the second one is new.
