@@ -189,8 +189,7 @@ def test_a_reset_and_another_image_size_begin_anew_without_reusing_ids():
 def test_simulated_rooms_keep_their_ids(seed):
     """True labels of a hand-held camera, two seconds: no face changes its id, none is mixed up."""
     camera, tracker = kinect_camera(160, 120), Tracker()
-    scene = kinect_room(seed, frames=60)
-    frames = []
+    scene, frames = kinect_room(seed, frames=60), []
     for k in range(0, 60, 2):  # every other frame, so twice the speed
         view = simulate(scene, Kinect(0, 'measured'), camera, frame=k)
         planes = fit_planes(view.labels, RangeImage.from_depth(view.depth, camera), KINECT)
