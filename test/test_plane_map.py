@@ -18,6 +18,7 @@ from rangeseg_ros.core.mapping.plane_grid import HIT, MISS, PlaneGrid
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import SequenceSegmenter, with_roles
+from rangeseg_ros.plan.floor_plan import deviation_of
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import Pose, Scene, kinect_room, walk
 from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
@@ -121,6 +122,7 @@ def test_parts_that_turn_out_to_be_one_surface_become_one_plane():
     assert counts[3] == 2
     (wall,) = plane_map.planes
     assert wall.observations == 2 * 8 - 1
+    assert plane_map.successors == {wall.id + 1: wall.id}
     assert wall.area == pytest.approx(sum(plane.area for plane in parts), rel=0.15)
 
 
@@ -155,7 +157,9 @@ def show(sequence, k, stamp, width=320, fixed=IDENTITY):
 
 @pytest.mark.parametrize('turn', [0.0, 25.0])
 def test_the_map_follows_a_jump_of_the_fixed_frame(turn):
-    sequence, sizes = SequenceSegmenter(CONFIG), []
+    # Odometry never jumps, but poses do that come beside it.
+    config = replace(CONFIG, odometry=turn > 0, fixed_frame='map')
+    sequence, sizes = SequenceSegmenter(config), []
     turned = Rotation.from_euler('z', turn, degrees=True).as_matrix()
     jump = Transform(turned, np.array([0.6, -0.5, 0.0]))
     for k in range(0, 48, 4):
@@ -173,6 +177,9 @@ def test_the_map_follows_a_jump_of_the_fixed_frame(turn):
         offset = normal @ (after[number].centroid - jump.shift) + plane.distance
         assert np.degrees(np.arccos(min(1, normal @ after[number].normal))) < 1.5
         assert abs(offset) < 0.03
+    # What the jump errs by, all of them do: the one that was known best is known worse.
+    best = min(before.values(), key=deviation_of)
+    assert deviation_of(after[best.id]) > deviation_of(best)
 
 
 def test_a_tread_that_is_taken_for_the_next_is_no_jump():
@@ -194,7 +201,10 @@ def test_a_tread_that_is_taken_for_the_next_is_no_jump():
             ids |= {p.label: face[q.label] + 1 for p, q in pairwise(level)} | {level[-1].label: 99}
         named = [replace(p, id=ids[p.label]) for p in planes]
         plane_map.add(view.labels, named, image, pose_of(pose), 10**9 + k * 10**9 // 30)
-    assert plane_map.jumps == []
+    assert plane_map.jumps == plane_map.doubts == []
+    plane_map.jumps += [(10**9, 'off')] * 12
+    more = '2 more frames whose poses the planes contradict'
+    assert plane_map.doubts == ['1.000 s: off'] * 10 + [more]
     heights = sorted(plane.centroid[2] for plane in plane_map.planes if plane.normal[2] > 0.9)
     np.testing.assert_allclose(heights[:4], 0.17 * np.arange(4), atol=0.03)
 
