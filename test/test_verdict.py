@@ -8,7 +8,7 @@ import pytest
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter, SequenceSegmenter, segment
 from rangeseg_ros.core.sensing.encoding import decoded, encoding
-from rangeseg_ros.core.sensing.enlargement import enlargement, interpolation, replication
+from rangeseg_ros.core.sensing.enlargement import interpolation, replication
 from rangeseg_ros.core.sensing.verdict import (
     _share_of_range,
     filled_share,
@@ -120,9 +120,7 @@ def test_levels_of_exact_scenes_are_not_replication():
     for left, right, top, bottom in ((200, 440, 120, 360), (160, 480, 160, 320)):
         depth = np.full((480, 640), 2.1)
         depth[top:bottom, left:right] = 2.0
-        camera = Camera.from_fov(640, 480, 57)
-        assert enlargement(RangeImage.from_depth(depth, camera)) is None
-        assert segment(depth, camera).verdict.ok
+        assert segment(depth, Camera.from_fov(640, 480, 57)).verdict.ok
 
 
 @pytest.mark.parametrize('seed', [1, 2])
@@ -133,18 +131,16 @@ def test_simulated_images_are_trusted(sensor, seed):
     assert verdict.ok and str(verdict) == 'trusted'
 
 
-def test_range_in_place_of_depth_is_told(seen):
-    distances = seen.depth * np.linalg.norm(seen.camera.rays, axis=2)
-    verdict = segment(distances / 1000, seen.camera).verdict
-    assert verdict.reasons == ('range instead of z',) and verdict.invalid
-
-
-@pytest.mark.parametrize('unit', [0.005, 0.0002, 0.01])
-def test_a_kinect_in_the_wrong_unit_is_told(seen, unit):
-    verdict = segment(seen.depth, seen.camera, unit).verdict
-    assert verdict.reasons == ('scale improbable',) and verdict.invalid
-    factor = max(unit / 0.001, 0.001 / unit)
-    assert f'{factor:g} times' in str(verdict)
+def test_a_kinect_that_is_misread_is_told(seen):
+    distances = seen.depth * np.linalg.norm(seen.camera.rays, axis=2) / 1000
+    for depth, unit, reason, told in (
+        (distances, None, 'range instead of z', 'multiply them by 1 / |ray|'),
+        (seen.depth, 0.005, 'scale improbable', '5 times too far'),
+        (seen.depth, 0.0002, 'scale improbable', '5 times too near'),
+        (seen.depth, 0.01, 'scale improbable', '10 times too far'),
+    ):
+        verdict = segment(depth, seen.camera, unit).verdict
+        assert verdict.reasons == (reason,) and verdict.invalid and told in str(verdict)
 
 
 @pytest.mark.filterwarnings('ignore:more than half of the pixels are')
@@ -162,8 +158,8 @@ def test_what_is_no_depth_in_metres_has_no_ground(seen, kind):
     first, *others = result.verdict.reasons
     assert first == told and 'scale improbable' not in others and result.verdict.invalid
     assert result.ground is None and not result.terrain.any()
-    verdict = Segmenter().segment(RangeImage.from_depth(0 * depth, seen.camera)).verdict
-    assert verdict.reasons == ('nothing measured',) and not verdict.ok
+    verdict = segment(0 * depth, seen.camera).verdict
+    assert verdict.reasons == ('nothing measured',)
 
 
 @pytest.mark.parametrize(
@@ -238,9 +234,7 @@ def test_errors_that_an_image_cannot_tell_are_said():
     assert 'distortion not identifiable' in verdict.reasons
 
 
-@pytest.fixture(scope='module')
-def room():
-    return simulate(kinect_room(731), Kinect(731), seed=731)
+SIGNS = {'disparity': 0, 'near is bright': 1, 'near is dark': -1}
 
 
 def pictured(frame, kind, levels=None):
@@ -257,21 +251,16 @@ def pictured(frame, kind, levels=None):
     return RangeImage.from_depth(np.where(known, 10 * values, 0).astype(np.float32), frame.camera)
 
 
-@pytest.mark.parametrize(
-    'kind, levels',
-    [('disparity', None), ('disparity', 255), ('near is bright', 255), ('near is dark', 255)],
-)
-def test_disparities_and_pictures_are_segmented_as_such(room, kind, levels):
-    image = pictured(room, kind, levels)
-    signs = {'disparity': 0, 'near is bright': 1, 'near is dark': -1}
-    assert np.sign(encoding(image)) == signs[kind]
+@pytest.mark.parametrize('kind, levels', [('disparity', None), *((kind, 255) for kind in SIGNS)])
+def test_disparities_and_pictures_are_segmented_as_such(seen, kind, levels):
+    image = pictured(seen, kind, levels)
+    assert np.sign(encoding(image)) == SIGNS[kind]
     result = Segmenter().segment(image)
     assert result.image is image and result.verdict.invalid
     assert result.values == ('picture' if 'near' in kind else 'disparity')
     assert result.verdict.reasons[0] == f'{result.values} instead of depth'
     assert result.ground is None and not result.terrain.any()
-    depth = Segmenter().segment(RangeImage.from_depth(room.depth, room.camera))
-    assert depth.verdict.ok
+    depth = segment(seen.depth, seen.camera)
     for plane in depth.planes[:3]:
         own = depth.labels == plane.label
         same = result.labels == np.bincount(result.labels[own]).argmax()
@@ -287,29 +276,25 @@ def test_what_is_nearest_in_a_picture_may_fill_no_block():
     assert 0.5 < (1 - q) * frame.depth.max() / (0.4 * near) < 2
 
 
-def test_only_pictures_begin_at_an_unknown_distance(room):
+def test_only_pictures_begin_at_an_unknown_distance(seen):
     """One surface that bends may look like that, and an image of more than 8 bits is measured."""
-    image = pictured(room, 'near is dark')
+    image = pictured(seen, 'near is dark')
     assert encoding(image) < 0
     fine = np.random.default_rng(1).uniform(0.9999, 1.0001, image.shape).astype(np.float32)
     assert encoding(replace(image, inverse=image.inverse * fine)) in (0.0, None)
 
 
-@pytest.mark.parametrize(
-    ('kind', 'power'), [('disparity', 0), ('near is bright', 1), ('near is dark', -1)]
-)
-def test_decoded_images_are_depths(room, kind, power):
-    """But for a factor."""
-    depth = RangeImage.from_depth(room.depth, room.camera)
-    known = room.depth[room.depth > 0]
-    q = 1 - (known.min() / known.max()) ** power
-    again = decoded(pictured(room, kind), q).inverse
+@pytest.mark.parametrize('kind', SIGNS)
+def test_decoded_images_are_depths_but_for_a_factor(seen, kind):
+    known = seen.depth[seen.depth > 0]
+    q = 1 - (known.min() / known.max()) ** SIGNS[kind]
+    again = decoded(pictured(seen, kind), q).inverse
     # The end that is black is no measurement.
-    seen = again > 0
-    assert (seen == depth.valid).mean() > 0.999
-    ratio = again[seen] / depth.inverse[seen]
+    shown = again > 0
+    assert (shown == (seen.depth > 0)).mean() > 0.999
+    ratio = again[shown] * seen.depth[shown]
     np.testing.assert_allclose(ratio, ratio[0], rtol=1e-3)
-    assert np.median(again[seen]) == pytest.approx(0.5)
+    assert np.median(again[shown]) == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize('size', [(160, 120), (320, 240), (640, 480)])
