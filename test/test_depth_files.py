@@ -165,7 +165,9 @@ def test_intrinsics_of_open3d(tmp_path):
 def test_intrinsics_of_numbers():
     assert Intrinsics(focal=(60, None, None, None)).of((48, 64)) == CAMERA
     assert Intrinsics(focal=(60, 61, 0.0, 1)).of((48, 64)) == Camera(64, 48, 60, 61, 0, 1)
-    assert Intrinsics(fov=90).of((48, 64)).fx == pytest.approx(32)
+    for fov in (0.5, 90):
+        focal = Intrinsics(fov=fov).of((48, 64)).fx
+        assert focal == pytest.approx(32 / np.tan(np.radians(fov / 2)))
     with pytest.raises(ValueError, match='between 0 and 180'):
         Intrinsics(fov=0).of((48, 64))
     with pytest.raises(ValueError, match='--camera FILE, --fov DEGREES'):
