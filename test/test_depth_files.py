@@ -204,18 +204,8 @@ def test_a_missing_extra_is_one_line(monkeypatch, run):
     assert code == 2 and "pip install 'rangeseg_ros[bags]'" in error
 
 
-HEADER = """# .PCD v0.7
-VERSION 0.7
-FIELDS x label normal
-SIZE 4 2 8
-TYPE F U F
-COUNT 1 1 3
-WIDTH 3
-HEIGHT 2
-VIEWPOINT 0 0 0 1 0 0 0
-POINTS 6
-DATA {}
-"""
+HEADER = '# .PCD v0.7\nVERSION 0.7\nFIELDS x label normal\nSIZE 4 2 8\nTYPE F U F\nCOUNT 1 1 3\n'
+HEADER += 'WIDTH 3\nHEIGHT 2\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 6\nDATA {}\n'
 RECORDS = np.zeros((2, 3), [('x', '<f4'), ('label', '<u2'), ('normal', '<f8', (3,))])
 RECORDS['x'] = [[0.5, np.nan, 2], [3, 4, 5]]
 RECORDS['label'] = [[0, 1, 65535], [3, 4, 5]]

@@ -1,6 +1,5 @@
 """Simulated scenes: ray casting, truth regions, random rooms, and what the command writes."""
 
-import csv
 from dataclasses import replace
 from unittest import mock
 
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from replays import rows_of
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE
@@ -30,6 +30,7 @@ from rangeseg_ros.simulation.terrain.scene import Site
 ORIGIN = np.zeros(3)
 UPRIGHT = np.eye(3)
 TRIANGLE = [(-0.5, -0.3), (0.6, -0.3), (0.1, 0.7)]
+CAMERA = Camera(80, 60, 72.0, 72.0, 39.5, 29.5)
 
 
 @pytest.mark.parametrize(
@@ -123,16 +124,11 @@ def test_points_of_a_region_lie_on_its_plane(build, seed):
     assert curved.mean() > 0.01 if build is scenes.curved_scene else not curved.any()
 
 
-def test_a_half_space_has_the_plane_of_any_normal():
-    np.testing.assert_allclose(half_space((0, 0, -2), (1, 0, 3)).planes, [[0, 0, -1, 3]])
-
-
 @pytest.mark.parametrize('kind', [*KINDS, *HARD])
 def test_heights_of_every_kind_of_terrain_are_those_of_its_parts(kind):
     """Ground is at 0 but for gaps of 2 mm, objects stand on it, and drops are below it."""
-    camera = Camera(80, 60, 72.0, 72.0, 39.5, 29.5)
     for seed in range(6):
-        frame = simulate_terrain(terrain_scene(kind, seed), Ideal(0), camera, seed)
+        frame = simulate_terrain(terrain_scene(kind, seed), Ideal(0), CAMERA, seed)
         top = frame.size + (0.05 if kind == 'overhead' else 0)  # of the middle of a bar
         deepest = -np.inf if kind == 'slope' else -frame.size
         # Under objects waves are not known exactly.
@@ -144,15 +140,12 @@ def test_heights_of_every_kind_of_terrain_are_those_of_its_parts(kind):
 
 
 def test_rough_ground_has_the_relief_it_says():
-    camera, scene = Camera(80, 60, 72.0, 72.0, 39.5, 29.5), terrain_scene('rough', 0)
+    scene = terrain_scene('rough', 0)
     rough, flat = (
-        simulate_terrain(replace(scene, relief=relief), Ideal(0), camera)
-        for relief in (scene.relief, 0.0)
+        simulate_terrain(made, Ideal(0), CAMERA) for made in (scene, replace(scene, relief=0.0))
     )
-    ground = flat.terrain == GROUND
-    off = (rough.depth - flat.depth)[ground]
-    fall = -(camera.rays @ scene.pose.rotation[2])[ground]
-    assert np.std(off * fall) == pytest.approx(scene.relief, rel=0.1)
+    off = (flat.depth - rough.depth) * (CAMERA.rays @ scene.pose.rotation[2])
+    assert np.std(off[flat.terrain == GROUND]) == pytest.approx(scene.relief, rel=0.1)
 
 
 def test_parts_of_a_terrain_are_where_they_say():
@@ -184,8 +177,9 @@ def test_pose_looks_where_it_says():
     # Optical z: along the world's y, downwards; optical x: to the right of it.
     assert pose.rotation[:, 2] == pytest.approx([0, np.cos(np.pi / 6), -0.5])
     assert pose.rotation[:, 0] == pytest.approx([1, 0, 0])
-    floor = Scene((half_space((0, 0, 1), ORIGIN),), (pose,))
-    assert floor.planes(pose)[0] == pytest.approx([0, -np.cos(np.pi / 6), -0.5, 1.0])
+    # Of a normal of any length.
+    floor = Scene((half_space((0, 0, 2), (3, 0, -0.5)),), (pose,))
+    assert floor.planes(pose)[0] == pytest.approx([0, -np.cos(np.pi / 6), -0.5, 1.5])
 
 
 SMALL = ['--width', '160', '--height', '120']
@@ -218,14 +212,11 @@ def test_kinect_folder_holds_the_scenes(tmp_path, simulated):
     truth = read_labels(output / 'truth' / f'{names[3]}.png')
     assert np.array_equal(truth, expected.labels)
 
-    with (output / 'planes.csv').open() as file:
-        rows = [row for row in csv.DictReader(file) if row['image'] == names[3]]
+    rows = [row for row in rows_of(output / 'planes.csv') if row.pop('image') == names[3]]
     for row, plane in zip(rows, expected.planes, strict=True):
-        assert [int(row['label']), int(row['face'])] == [plane.label, plane.face]
-        assert int(row['count']) == (truth == plane.label).sum()
-        normal = [float(row[f'normal_{axis}']) for axis in 'xyz']
-        assert normal == pytest.approx(plane.normal, abs=1e-8)
-        assert float(row['distance']) == pytest.approx(plane.distance, abs=1e-7)
+        told = plane.label, plane.face, *plane.normal, plane.distance, (truth == plane.label).sum()
+        assert [float(value) for value in row.values()] == pytest.approx(told, abs=1e-8)
+        assert [*row][2:] == ['normal_x', 'normal_y', 'normal_z', 'distance', 'count']
 
     with DepthBag(output / 'bag') as bag:
         first, _, _, last = bag

@@ -11,7 +11,9 @@ from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.by_normals.directions import directions
 from rangeseg_ros.core.by_normals.labelling import (
     _nearest_directions,
+    data_costs,
     degrees,
+    label_costs,
     minimise,
     minimise_exactly,
 )
@@ -110,7 +112,6 @@ def test_a_result_can_be_pickled_with_its_energy(config):
     # Found when it is asked for, here or in another process.
     for found in (result, copy):
         assert found.tilt.degrees == pytest.approx(np.degrees(np.arccos(0.8)), abs=1)
-    assert segment(corner(), replace(config, up_y=-0.8, up_z=-0.6)).tilt is None
 
 
 DIRECTIONS = directions(73).astype(np.float32)
@@ -154,6 +155,20 @@ def test_the_first_of_the_nearest_directions_is_taken():
     expected = (np.nan_to_num(normals) @ DIRECTIONS.T).argmax(axis=2)
     found = _nearest_directions(normals, DIRECTIONS)
     np.testing.assert_array_equal(found, expected)
+
+
+def test_costs_of_squares_are_sums_of_angles():
+    random = np.random.default_rng(1)
+    normals, label = random.normal(size=(8, 8, 3)), random.integers(0, 73, (2, 2), np.int32)
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    normals[6:], normals[:, 7:] = np.nan, np.nan  # outside of the image
+    angles = np.degrees(np.arccos((normals * DIRECTIONS[label].repeat(4, 0).repeat(4, 1)).sum(2)))
+    expected = np.nansum(angles.reshape(2, 4, 2, 4), axis=(1, 3))
+    arguments = 4, normals[:6, :7].astype(np.float32), DIRECTIONS
+    np.testing.assert_allclose(data_costs(label, *arguments), expected, rtol=1e-5)
+    for k, each in np.ndenumerate(label):
+        found = label_costs(each, np.arange(4, dtype=np.int32), *arguments)
+        assert found.reshape(2, 2)[k] == pytest.approx(expected[k], rel=1e-5)
 
 
 def test_angles_of_the_kernel_are_those_of_the_arc_cosine():
