@@ -77,15 +77,11 @@ def test_where_there_is_no_room_the_file_is_named(tmp_path):
 
 def test_what_is_no_camera_is_named(tmp_path):
     path = tmp_path / 'camera.yaml'
-    for content, message in (
-        ('- 1', 'not a camera calibration'),
-        ('{image_width: 4, image_height: 3}', "lacks 'camera_matrix'"),
-    ):
-        path.write_text(content)
-        with pytest.raises(CameraError, match=f'{path}: .*{message}'):
-            read_camera(path)
-    with pytest.raises(FileError, match='No such file'):
-        read_camera(tmp_path / 'none.yaml')
+    with pytest.raises(FileError, match=f'{path}: No such file'):
+        read_camera(path)
+    path.write_text('- 1')
+    with pytest.raises(CameraError, match=f'{path}: not a camera calibration'):
+        read_camera(path)
 
 
 def test_flat_and_ros_parameter_files_say_the_same(tmp_path):
@@ -107,9 +103,10 @@ def test_flat_and_ros_parameter_files_say_the_same(tmp_path):
     path.write_text('')
     assert read_config(path) == read_config(None) == Config()
     assert read_config(path, smoothness=3.0) == Config(smoothness=3.0)
+    assert [read_config(path) for path in Path(__file__).parents[1].glob('params/*.yaml')]
 
 
-def test_parameters_of_the_node_alone_do_no_harm(tmp_path):
+def test_parameters_of_the_node_alone_and_of_others_do_no_harm(tmp_path):
     path = tmp_path / 'params.yaml'
     others = {'use_sim_time': True, 'stall_timeout': 3.0}
     others['qos_overrides./depth/image_rect.subscription.depth'] = 1
@@ -117,16 +114,14 @@ def test_parameters_of_the_node_alone_do_no_harm(tmp_path):
     parameters = {'ros__parameters': {'smoothness': 12.5, **others}}
     path.write_text(yaml.safe_dump({'segment_planes': parameters}))
     assert read_config(path) == Config(smoothness=12.5)
+    path.write_text('/**: {ros__parameters: {min_pixels: 7, exposure: 3, use_sim_time: true}}')
+    with pytest.warns(UserWarning, match="unknown parameter 'exposure' .of another node"):
+        assert read_config(path) == Config(min_pixels=7)
     pytest.importorskip('rclpy')
     from rangeseg_ros.ros.parameters import NodeConfig
 
     names = {field.name for field in fields(NodeConfig)} - {f.name for f in fields(Config)}
     assert names <= NODE_ONLY
-
-
-def test_the_parameter_files_of_the_package_are_valid():
-    files = list(Path(__file__).parents[1].glob('params/*.yaml'))
-    assert [read_config(path) for path in files]
 
 
 def grown(part, whole):
@@ -206,13 +201,6 @@ def test_pipes_are_not_waited_for(folder, refused):
     for image, camera in (('pipe', 'camera.yaml'), (seen, 'pipe'), (seen, '/dev/zero')):
         error = refused('segment', image, '--camera', camera, '--output', 'out')
         assert 'not a regular file' in error
-
-
-def test_a_shared_file_may_name_parameters_of_other_nodes(tmp_path):
-    path = tmp_path / 'file.yaml'
-    path.write_text('/**: {ros__parameters: {min_pixels: 7, exposure: 3, use_sim_time: true}}')
-    with pytest.warns(UserWarning, match="unknown parameter 'exposure' .of another node"):
-        assert read_config(path) == Config(min_pixels=7)
 
 
 def test_sizes_are_checked_before_images_are_decoded(tmp_path, monkeypatch):

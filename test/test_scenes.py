@@ -223,13 +223,11 @@ def test_kinect_folder_holds_the_scenes(tmp_path, simulated):
     assert np.array_equal(last.depth, expected.depth) and last.stamp - first.stamp == 100_000_000
 
 
-def test_noise_free_png_is_rounded_and_bag_exact(simulated):
-    output = simulated('kinect', '--scenes', 1, '--noise', 'none')
-    depth = cv2.imread(str(output / 'depth' / '000000.png'), cv2.IMREAD_UNCHANGED)
-    with DepthBag(output / 'bag') as bag:
+def test_without_noise_the_bag_has_exact_metres(simulated):
+    with DepthBag(simulated('kinect', '--scenes', 1, '--noise', 'none') / 'bag') as bag:
         (frame,) = bag
-    assert depth.dtype == np.uint16 and frame.depth.dtype == np.float32
-    assert np.abs(1000 * frame.depth - depth).max() <= 0.501
+    expected = simulate(scenes.kinect_room(0), Kinect(0, 'none'), kinect_camera(160, 120))
+    np.testing.assert_array_equal(frame.depth, expected.depth)
 
 
 def test_nothing_is_overwritten_or_left_half_written(tmp_path, monkeypatch, refused):
