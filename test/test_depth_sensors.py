@@ -43,10 +43,9 @@ def block_deviations(depth, labels, size):
     inverse = blocks(1 / np.where(depth > 0, depth, np.inf))
     label = blocks(labels)
     flat = (label.min(1) == label.max(1)) & (label[:, 0] > 0)
-    v, u = np.mgrid[:size, :size] - (size - 1) / 2
-    base, _ = np.linalg.qr(np.stack([np.ones(size * size), u.ravel(), v.ravel()], axis=1))
-    residual = inverse[flat] - inverse[flat] @ base @ base.T
-    return np.sqrt((residual**2).sum(1) / (size * size - 3))
+    plane = np.stack([np.ones(size * size), *np.indices((size, size)).reshape(2, -1)], axis=1)
+    squares = np.linalg.lstsq(plane, inverse[flat].T, rcond=None)[1]
+    return np.sqrt(squares / (size * size - 3))
 
 
 # Medians over the blocks of 4, 8, 16 and 32 pixels on the planes of real frames: Kinect (six

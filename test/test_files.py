@@ -1,6 +1,5 @@
 """Images, cameras, parameters and tables: what is read back, and refused in one line."""
 
-import csv
 import json
 import os
 import resource
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from planes_of_labels import stated_plane
+from replays import rows_of
 
 from rangeseg_ros import CameraError, Config, ConfigError
 from rangeseg_ros.cli.errors import one_line
@@ -176,8 +176,7 @@ def test_plane_table(tmp_path):
         append([0, *values(plane)] for plane in (stated_plane(1), stated_plane(2)))
         append([])
         append([[2, *values(replace(stated_plane(1), distance=1 / 3))]])
-        with path.open() as file:  # on disk before the table is closed
-            rows = list(csv.DictReader(file))
+        rows = rows_of(path)  # on disk before the table is closed
     assert [(row['frame'], row['label']) for row in rows] == [('0', '1'), ('0', '2'), ('2', '1')]
     assert [float(rows[0][f'normal_{axis}']) for axis in 'xyz'] == [0.0, 0.0, -1.0]
     assert float(rows[0]['covariance_yd']) == 7.0  # normal_y with distance

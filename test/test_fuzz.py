@@ -34,33 +34,25 @@ def depths(draw):
         return depth.astype(kind)
 
 
-@st.composite
-def cameras(draw, shape):
-    focal = draw(st.sampled_from([1.0, 30.0, 300.0, 1e5]))
-    # As wide as at 1 pixel no lens shows the world.
-    bent = {'distortion_model': 'plumb_bob', 'd': (-0.2, 0, 0, 0)}
-    lens = draw(st.sampled_from([{}, {}, bent])) if focal > 1 else {}
-    height, width = shape
-    return Camera(width, height, focal, 0.8 * focal, width / 2, height / 2, **lens)
-
-
 @pytest.mark.parametrize('method', ['planes', 'normals'])
 @settings(max_examples=60)
 @given(data=st.data())
 def test_invariants(method, data):
-    depth = data.draw(depths())
-    camera = data.draw(cameras(depth.shape))
+    depth, focal = data.draw(depths()), data.draw(st.sampled_from([1.0, 30.0, 300.0, 1e5]))
+    # As wide as at 1 pixel no lens shows the world.
+    d = data.draw(st.sampled_from([(), (), (-0.2, 0, 0, 0)])) if focal > 1 else ()
+    centre, lens = (depth.shape[1] / 2, depth.shape[0] / 2), {'distortion_model': 'plumb_bob'}
+    camera = Camera(*depth.shape[::-1], focal, 0.8 * focal, *centre, **lens, d=d)
     config = Config(method=method, min_pixels=data.draw(st.sampled_from([1, 20, 200])))
     before = depth.tobytes()
     with warnings.catch_warnings():
         warnings.simplefilter('error')
         warnings.simplefilter('ignore', UnitWarning)
-        image = RangeImage.from_depth(depth, camera)
-        result = Segmenter(config).segment(image)
+        result = Segmenter(config).segment(RangeImage.from_depth(depth, camera))
         hulls = [plane.hull for plane in result.planes]
     assert depth.tobytes() == before
     assert result.labels.shape == depth.shape and result.labels.dtype == np.uint16
-    assert not result.labels[~image.valid].any()
+    assert not result.labels[~result.image.valid].any()
     assert set(np.unique(result.labels)) - {0} == {plane.label for plane in result.planes}
     assert bool(result.reason) == (not result.planes) and np.isfinite(result.energy)
     for plane, hull in zip(result.planes, hulls, strict=True):
