@@ -1,7 +1,6 @@
 """Intrinsics from every source, lenses against OpenCV, planes behind them, what is refused."""
 
 import pickle
-import warnings
 from dataclasses import astuple
 
 import cv2
@@ -167,6 +166,7 @@ def test_planes_behind_a_lens(model, d, method):
     assert (np.ptp(plane.hull, axis=0) > np.ptp(points, axis=0)).all()
 
 
+@pytest.mark.filterwarnings('error')
 def test_what_is_rectified_and_what_is_raw():
     k = [[300, 0, 159.5], [0, 310, 119.5], [0, 0, 1]]
     p, d = [[290, 0, 160, 0], [0, 290, 120, 0], [0, 0, 1, 0]], (-0.3, 0.1, 0, 0, 0)
@@ -179,14 +179,12 @@ def test_what_is_rectified_and_what_is_raw():
     for choice in (None, False):
         with pytest.warns(CameraWarning, match='D beside P'):
             assert camera(p, choice) == rectified
-    with warnings.catch_warnings():
-        warnings.simplefilter('error')
-        assert camera(p, True) == raw
-        assert camera(None) == camera(np.zeros(12)) == camera(None, True) == raw
-        assert camera(None, False, np.zeros(5)) == lens('')
-        assert camera(p, d=np.zeros(5)) == camera(p, d=()) == rectified
-        with pytest.raises(CameraError, match='no P'):
-            camera(None, False)
+    assert camera(p, True) == raw
+    assert camera(None) == camera(np.zeros(12)) == camera(None, True) == raw
+    assert camera(None, False, np.zeros(5)) == lens('')
+    assert camera(p, d=np.zeros(5)) == camera(p, d=()) == rectified
+    with pytest.raises(CameraError, match='no P'):
+        camera(None, False)
     for broken in (np.nan, -290.0, 0.0):
         with pytest.raises(CameraError, match=r'fx must be (finite|positive)'):
             camera([[broken, *p[0][1:]], *p[1:]], d=())
@@ -226,6 +224,7 @@ def test_coefficients_that_no_lens_has_are_refused(model, value):
         lens(model, value, 0.0, 0.0, 0.0)
 
 
+@pytest.mark.filterwarnings('error')
 def test_a_lens_that_folds_the_image_is_told():
     with pytest.warns(CameraWarning, match=r'folds the image: .*% of it is left out'):
         folded = lens('plumb_bob', -0.8, 0.0, 0.0, 0.0)
@@ -233,10 +232,8 @@ def test_a_lens_that_folds_the_image_is_told():
     image = RangeImage.from_depth(np.full(folded.shape, 1000, np.uint16), folded)
     assert image.valid[120, 160] and not image.valid[0, 0]
     np.testing.assert_array_equal(image.valid, folded.rays.any(axis=2))
-    with warnings.catch_warnings():
-        warnings.simplefilter('error')
-        lens('plumb_bob', -0.2, 0.0, 0.0, 0.0)
-        lens('equidistant', 0.0, 0.0, 0.0, 0.0)
+    for model, k1 in (('plumb_bob', -0.2), ('equidistant', 0.0)):
+        lens(model, k1, 0.0, 0.0, 0.0)
 
 
 def test_rays_are_left_out_where_none_is_found_beside_the_fold():

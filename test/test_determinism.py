@@ -7,7 +7,6 @@ import os
 import sys
 import threading
 import time
-import warnings
 from dataclasses import replace
 
 import cv2
@@ -119,18 +118,17 @@ def images():
 def frames():
     """What is told of each image: its name, labels and terrain as a digest, and planes."""
     frames = []
-    with warnings.catch_warnings():
-        warnings.simplefilter('ignore')
-        for name, config, image in images():
-            result = SequenceSegmenter(config).segment(image, 0)
-            told = hashlib.sha256(result.labels.tobytes() + result.terrain.tobytes()).hexdigest()
-            digits = 6 if 'far' in name else 16  # at 100 km, the others follow the order of sums
-            planes = ([*p.normal, 1 / p.distance, p.count] for p in result.planes)
-            frames.append([name, told, np.round([*planes], digits).tolist()])
+    for name, config, image in images():
+        result = SequenceSegmenter(config).segment(image, 0)
+        told = hashlib.sha256(result.labels.tobytes() + result.terrain.tobytes()).hexdigest()
+        digits = 6 if 'far' in name else 16  # at 100 km, the others follow the order of sums
+        planes = ([*p.normal, 1 / p.distance, p.count] for p in result.planes)
+        frames.append([name, told, np.round([*planes], digits).tolist()])
     return frames
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings('ignore')
 def test_plain_python_gives_what_compiled_code_gives():
     """And reads and writes within arrays: NumPy checks every index, compiled code does not."""
     plain, compiled = in_another_process(frames, NUMBA_DISABLE_JIT='1'), frames()

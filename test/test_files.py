@@ -17,7 +17,7 @@ from rangeseg_ros import CameraError, Config, ConfigError
 from rangeseg_ros.cli.errors import one_line
 from rangeseg_ros.cli.options import write_json
 from rangeseg_ros.io.cameras import read_camera
-from rangeseg_ros.io.files import FileError, replacing
+from rangeseg_ros.io.files import FileError
 from rangeseg_ros.io.images import read_depth, read_labels, write_image
 from rangeseg_ros.io.params import NODE_ONLY, read_config, read_params
 from rangeseg_ros.io.tables import columns, open_table, values
@@ -25,21 +25,15 @@ from rangeseg_ros.io.yaml_files import read_yaml
 
 
 def test_what_is_no_depth_image_is_named(tmp_path):
-    for name, image, message in (
-        ('colour.png', np.zeros((4, 5, 3), np.uint16), 'one channel, not 3'),
-        ('a.bmp', np.ones((8, 8), np.uint8), 'PNG, PGM, PFM, or TIFF'),
-    ):
-        cv2.imwrite(str(tmp_path / name), image)
-        with pytest.raises(FileError, match=f'{name}: .*{message}'):
+    cv2.imwrite(str(tmp_path / 'colour.png'), np.zeros((4, 5, 3), np.uint16))
+    cv2.imwrite(str(tmp_path / 'a.bmp'), np.ones((8, 8), np.uint8))
+    for number, content in enumerate((b'', b'no image', b'\x89PNG\r\n\x1a\n')):
+        (tmp_path / f'{number}.png').write_bytes(content)
+    told = dict.fromkeys(('a.bmp', '0.png', '1.png', '2.png'), 'no readable PNG, PGM, PFM, or')
+    told |= {'colour.png': '.* one channel, not 3', 'none.png': 'No such file'}
+    for name, message in {**told, '': 'Is a directory'}.items():
+        with pytest.raises(FileError, match=f'^{tmp_path / name}: {message}'):
             read_depth(tmp_path / name)
-    with pytest.raises(FileError, match=r'none\.png: No such file'):
-        read_depth(tmp_path / 'none.png')
-    with pytest.raises(FileError, match='Is a directory'):
-        read_depth(tmp_path)
-    for content in (b'', b'no image', b'\x89PNG\r\n\x1a\n'):
-        (tmp_path / 'text.png').write_bytes(content)
-        with pytest.raises(FileError, match=r'text\.png: no readable PNG'):
-            read_depth(tmp_path / 'text.png')
 
 
 def test_labels_are_written_and_read_back_and_pictures_are_rgb(tmp_path):
@@ -52,18 +46,9 @@ def test_labels_are_written_and_read_back_and_pictures_are_rgb(tmp_path):
         read_labels(tmp_path / 'red.png')
 
 
-def test_a_failed_write_leaves_what_was_there(tmp_path):
-    path = tmp_path / 'file'
-    path.write_text('old')
-    with pytest.raises(RuntimeError), replacing(path) as partial:
-        partial.write_text('half')
-        raise RuntimeError
-    assert path.read_text() == 'old'
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_where_there_is_no_room_the_file_is_named(tmp_path):
+def test_where_there_is_no_room_the_file_is_named_and_stays_as_it_was(tmp_path):
     path, (soft, hard) = tmp_path / 'picture.png', resource.getrlimit(resource.RLIMIT_FSIZE)
+    path.write_text('old')
     noise = np.random.default_rng(0).integers(0, 255, (200, 200), np.uint8)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
     try:
@@ -72,7 +57,7 @@ def test_where_there_is_no_room_the_file_is_named(tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert one_line(caught.value) == f'{path}: File too large'
-    assert not list(tmp_path.iterdir())
+    assert path.read_text() == 'old' and list(tmp_path.iterdir()) == [path]
 
 
 def test_what_is_no_camera_is_named(tmp_path):
@@ -143,8 +128,6 @@ WIDE = f'a: &a {{{"".join(f"{k}: 1, " for k in range(3000))}}}\nb: [{"*a, " * 90
         ('3: 4', 'unknown parameter 3'),
         ('node: {ros__parameters: {smoothness: 1.0}}', 'no ros__parameters of segment_planes'),
         ('segment_planes: {ros__parameters: [1, 2]}', 'no mapping'),
-        ('segment_planes: {ros__parameters: "ab"}', 'no mapping'),
-        ('segment_planes: 3\nother: {ros__parameters: {}}', 'no section'),
         ('min_pixels: 3\nsegment_planes: {ros__parameters: {}}', 'no section'),
         ('noise: 1' + '0' * 400, 'noise must be in'),
         ('min_pixels: 1' + '0' * 400, 'min_pixels must be in'),

@@ -110,9 +110,10 @@ def test_face_cut_in_two_gives_two_regions_of_one_face():
 
 
 @pytest.mark.parametrize('build', [scenes.kinect_room, scenes.curved_scene])
+@pytest.mark.parametrize('sensor', [Kinect(0, 'none'), Ideal(0)])
 @pytest.mark.parametrize('seed', range(3))
-def test_points_of_a_region_lie_on_its_plane(build, seed):
-    frame = simulate(build(seed, 30), Kinect(0, 'none'), kinect_camera(320, 240), frame=29)
+def test_points_of_a_region_lie_on_its_plane_exactly(build, sensor, seed):
+    frame = simulate(build(seed, 30), sensor, kinect_camera(320, 240), frame=29)
     points = frame.depth[..., None].astype(float) * frame.camera.rays
     for plane in frame.planes:
         assert plane.distance > 0 and np.linalg.norm(plane.normal) == pytest.approx(1)

@@ -125,11 +125,8 @@ def test_energy_is_close_to_that_of_the_full_expansion():
     """1 % is the package's promise, of rooms."""
     camera = kinect_camera(320, 240)
     depth = simulate(kinect_room(5), Kinect(0), camera, seed=5).depth
-    image = RangeImage.from_depth(depth, camera)
-    fast, full = (
-        Segmenter(Config(method='normals', direction_count=73, exact=exact)).segment(image).energy
-        for exact in (False, True)
-    )
+    configs = (replace(NORMALS, direction_count=73, exact=exact) for exact in (False, True))
+    fast, full = (segment(depth, config, camera).energy for config in configs)
     assert full <= fast <= 1.01 * full
 
 
