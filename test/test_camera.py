@@ -18,6 +18,7 @@ from rangeseg_ros import (
 )
 from rangeseg_ros.core.sensing.camera import CameraWarning
 from rangeseg_ros.core.sensing.lens import _lens, undistort
+from rangeseg_ros.io.cameras import read_camera, write_camera
 
 K = [[500, 0, 320], [0, 510, 240], [0, 0, 1]]
 P = [[450, 0, 310, 0], [0, 460, 235, 0], [0, 0, 1, 0]]
@@ -124,8 +125,10 @@ LENSES = [
 
 
 @pytest.mark.parametrize(('model', 'd'), [('', ()), *LENSES])
-def test_opencv_sees_the_rays_at_their_pixels(model, d):
+def test_opencv_sees_the_rays_at_their_pixels(tmp_path, model, d):
     camera = lens(model, *d, skew=3.0)
+    write_camera(tmp_path / 'camera.yaml', camera)
+    assert read_camera(tmp_path / 'camera.yaml') == camera
     rays = camera.rays.reshape(-1, 3).astype(np.float64)
     assert (rays[:, 2] == 1).all() and camera.rays.dtype == np.float32
     if model == 'equidistant':
@@ -170,8 +173,7 @@ def test_planes_behind_a_lens(model, d, method):
 def test_what_is_rectified_and_what_is_raw():
     k = [[300, 0, 159.5], [0, 310, 119.5], [0, 0, 1]]
     p, d = [[290, 0, 160, 0], [0, 290, 120, 0], [0, 0, 1, 0]], (-0.3, 0.1, 0, 0, 0)
-    rectified = Camera(320, 240, 290, 290, 160, 120)
-    raw = lens('plumb_bob', *d)
+    rectified, raw = Camera(320, 240, 290, 290, 160, 120), lens('plumb_bob', *d)
 
     def camera(p, raw=None, d=d):
         return camera_from_matrices(320, 240, k, p, distortion_model='plumb_bob', d=d, raw=raw)

@@ -51,7 +51,7 @@ def write_exr(path, channels):
 
 
 KINDS = ['png', 'pgm', 'float.pfm', 'tiff', 'float.tiff', 'npy', 'int64.npy', 'npz']
-KINDS += ['Z.exr', 'R,G,B.exr', 'A.Z,B.R.exr']
+KINDS += ['Z.exr', 'R,G,B,A.exr', 'A.Z,B.R.exr']
 
 
 @pytest.mark.parametrize('kind', KINDS)
@@ -59,7 +59,8 @@ def test_images(kind, depth, tmp_path):
     path = tmp_path / f'frame.{kind}'
     metres = depth.astype(np.float32) / 1000
     if kind.endswith('exr'):
-        write_exr(path, {name: metres * (name != 'B.R') for name in kind[:-4].split(',')})
+        parts = kind[:-4].split(',')
+        write_exr(path, {name: metres * (name not in ('A', 'B.R')) for name in parts})
     elif kind == 'npz':
         np.savez_compressed(path, colour=np.zeros((48, 64, 3)), depth=metres)
     elif kind.endswith('npy'):

@@ -123,11 +123,10 @@ def test_stereo_sees_nothing_left_of_an_object_and_at_the_left_border():
     blind = (frame.depth == 0).mean(axis=0)
     border = 424 * BASELINE / far
     assert blind[: int(border) - 2].min() > 0.95 and blind[int(border) + 3] < 0.3
-    left = 424 - 424 * 0.2 / near
+    left, right = 424 - 424 * 0.2 / near, 424 + 424 * 0.2 / near
     shadow = 424 * BASELINE * (1 / near - 1 / far)
     rows = frame.depth[160:320]
     assert (rows[:, int(left - shadow) + 3 : int(left) - 3] == 0).mean() > 0.95
-    right = 424 + 424 * 0.2 / near
     assert (rows[:, int(right) + 5 : int(right + shadow)] == 0).mean() < 0.3
 
 
@@ -165,12 +164,10 @@ def test_shadow_lies_left_of_the_occluder_and_is_as_wide_as_parallax(noise):
 
 @pytest.mark.parametrize('sensor', [*(Kinect(0, noise) for noise in NOISES[:3]), RealSense()])
 def test_depth_takes_only_the_values_of_quantised_disparity(sensor):
-    camera = resize(sensor.camera, 320, 240)
-    frame = simulate(kinect_room(0), sensor, camera, seed=1)
+    frame = simulate(kinect_room(0), sensor, resize(sensor.camera, 320, 240), seed=1)
     assert frame.depth.dtype == np.uint16
-    stereo = isinstance(sensor, RealSense)
     # Of the data sheet and of real frames, 1/m.
-    quantum = 1 / (camera.fx * 0.05 * 32) if stereo else 0.0029
+    quantum = 1 / (frame.camera.fx * 0.05 * 32) if isinstance(sensor, RealSense) else 0.0029
     possible = np.rint(1000 / (quantum * np.arange(1, 126 * 32 + 1)))
     assert np.isin(frame.depth[frame.depth > 0], possible).all()
 

@@ -202,11 +202,8 @@ def test_a_program_ends_after_its_tasks():
 
 
 def test_errors_come_back():
-    def kernel(first, after):
-        raise ValueError(str(first))
-
-    with pytest.raises(ValueError, match='0'):
-        map_halves(kernel, 100)
+    with pytest.raises(ValueError, match='half from 0'):
+        map_halves(lambda first, after: int(f'half from {first}'), 100)
     with pytest.raises(ValueError, match='late'):
         Task(lambda: (time.sleep(0.05), int('late'))).result()
 

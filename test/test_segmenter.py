@@ -150,8 +150,7 @@ def test_the_first_of_the_nearest_directions_is_taken():
     normals = np.random.default_rng(1).normal(size=(6, 7, 3)).astype(np.float32)
     normals[0], normals[1] = 0, np.nan
     expected = (np.nan_to_num(normals) @ DIRECTIONS.T).argmax(axis=2)
-    found = _nearest_directions(normals, DIRECTIONS)
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(_nearest_directions(normals, DIRECTIONS), expected)
 
 
 def test_costs_of_squares_are_sums_of_angles():
@@ -170,9 +169,8 @@ def test_costs_of_squares_are_sums_of_angles():
 
 def test_angles_of_the_kernel_are_those_of_the_arc_cosine():
     cosines = np.append(np.linspace(-1, 1, 501), [1 + 1e-7, -1 - 1e-7]).astype(np.float32)
-    found = [degrees(cosine) for cosine in cosines]
     expected = np.degrees(np.arccos(np.clip(cosines.astype(float), -1, 1)))
-    np.testing.assert_allclose(found, expected, atol=1e-4)
+    np.testing.assert_allclose([degrees(cosine) for cosine in cosines], expected, atol=1e-4)
     assert degrees(np.float32(np.nan)) == 0
 
 
