@@ -137,10 +137,9 @@ def test_which_way_a_scanner_looks(turn, around):
     np.testing.assert_array_equal(RangeImage.from_points(points).axes, turn)
 
 
-@pytest.mark.parametrize('size', [(32, 24), (160, 120), (1280, 720)])
+@pytest.mark.parametrize(('width', 'height'), [(32, 24), (160, 120), (1280, 720)])
 @pytest.mark.parametrize('scale', [1, 3])
-def test_where_the_camera_is(size, scale):
-    width, height = size
+def test_where_the_camera_is(width, height, scale):
     camera = Camera(width, height, 0.9 * width, 0.91 * width, width / 2 - 0.3, height / 2 + 0.4)
     points = scale * room(7, camera)[0].points
     points[np.random.default_rng(1).random(points.shape[:2]) < 0.3] = np.nan

@@ -12,6 +12,7 @@ from rangeseg_ros.cli import evaluate, mount, replay
 from rangeseg_ros.core.options import ConfigError
 
 FIELDS = {f.name: f for f in fields(Config)}
+VALUES = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5))
 
 
 def test_every_default_lies_in_its_range_and_every_parameter_is_described():
@@ -62,13 +63,7 @@ def test_refusals_name_the_parameter_and_what_it_takes(values, words):
     assert '\n' not in message and [word for word in words if word not in message] == []
 
 
-@given(
-    st.dictionaries(
-        st.sampled_from(sorted(FIELDS)),
-        st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5)),
-        max_size=3,
-    )
-)
+@given(st.dictionaries(st.sampled_from(sorted(FIELDS)), VALUES, max_size=3))
 def test_any_mapping_gives_a_valid_config_or_a_config_error(mapping):
     try:
         config = Config.from_mapping(mapping)

@@ -139,8 +139,7 @@ def test_surfaces_at_grazing_angles_are_not_seen(sensor, limit):
 
 def test_slopes_of_a_depth_image():
     camera = Camera(160, 120, 146.0, 146.0, 79.5, 59.5)
-    angle = np.radians(50)
-    normal = np.array([0, np.sin(angle), -np.cos(angle)])
+    normal = np.array([0, np.sin(np.radians(50)), -np.cos(np.radians(50))])
     rays = camera.rays.astype(float)
     cosine = -(rays @ normal) / np.linalg.norm(rays, axis=-1)
     found, seen = slopes(rays @ normal / -2.0, camera), cosine > 0.1
@@ -165,10 +164,10 @@ def test_shadow_lies_left_of_the_occluder_and_is_as_wide_as_parallax(noise):
 @pytest.mark.parametrize('sensor', [*(Kinect(0, noise) for noise in NOISES[:3]), RealSense()])
 def test_depth_takes_only_the_values_of_quantised_disparity(sensor):
     frame = simulate(kinect_room(0), sensor, resize(sensor.camera, 320, 240), seed=1)
-    assert frame.depth.dtype == np.uint16
     # Of the data sheet and of real frames, 1/m.
     quantum = 1 / (frame.camera.fx * 0.05 * 32) if isinstance(sensor, RealSense) else 0.0029
     possible = np.rint(1000 / (quantum * np.arange(1, 126 * 32 + 1)))
+    assert frame.depth.dtype == np.uint16
     assert np.isin(frame.depth[frame.depth > 0], possible).all()
 
 

@@ -76,15 +76,14 @@ def test_clouds_keep_their_points():
     np.testing.assert_allclose(np.linalg.norm(image.rays[image.valid], axis=1), 1, rtol=1e-6)
 
 
-# Numbers of a data sheet, of a calibration, and of a tiny sensor.
-CAMERAS = (
-    Camera(160, 120, 131.0, 131.5, 79.5, 59.5),
-    Camera(212, 160, 178.8243, 179.2906, 105.819287, 79.129813),
-    Camera(16, 12, 14.0, 14.0, 7.25, 5.5),
+@pytest.mark.parametrize(
+    'camera',
+    [
+        Camera(160, 120, 131.0, 131.5, 79.5, 59.5),  # numbers of a data sheet
+        Camera(212, 160, 178.8243, 179.2906, 105.819287, 79.129813),  # of a calibration
+        Camera(16, 12, 14.0, 14.0, 7.25, 5.5),
+    ],
 )
-
-
-@pytest.mark.parametrize('camera', CAMERAS)
 @pytest.mark.parametrize('holes', ['none', 'random', 'columns', 'left'])
 def test_the_cloud_of_a_pinhole_camera_is_its_depth_image(camera, holes):
     """Made in float32 as depth_image_proc does."""

@@ -45,13 +45,11 @@ CAMERA = Camera(80, 60, 72.0, 72.0, 39.5, 29.5)
         # Exactly along the plane of a side face, beyond it, and just within.
         (box((1, 1, 1), UPRIGHT, (0.6, 0, 3)), (0, 0, 1), np.inf, -1),
         (box((1, 1, 1), UPRIGHT, (0.4, 0, 3)), (0, 0, 1), 2.5, 5),
-        # From inside nothing is entered.
-        (box((1, 1, 1), UPRIGHT, (0, 0, 0)), (0, 0, 1), np.inf, -1),
+        (box((1, 1, 1), UPRIGHT, (0, 0, 0)), (0, 0, 1), np.inf, -1),  # entered by none from inside
         (sphere(0.5, (0, 0, 2)), (0, 0, 1), 1.5, 0),
         (sphere(0.5, (0.5 + 1e-9, 0, 2)), (0, 0, 1), np.inf, -1),
         (cylinder(0.5, 1, UPRIGHT, (2, 0, 0)), (1, 0, 0), 1.5, 2),
-        # Along the axis of a cylinder its end is hit, or nothing.
-        (cylinder(0.5, 1, UPRIGHT, (0, 0, 2)), (0, 0, 1), 1.5, 1),
+        (cylinder(0.5, 1, UPRIGHT, (0, 0, 2)), (0, 0, 1), 1.5, 1),  # along its axis
         (cylinder(0.5, 1, UPRIGHT, (0.6, 0, 2)), (0, 0, 1), np.inf, -1),
     ],
 )
