@@ -209,14 +209,16 @@ def test_errors_come_back():
 
 
 @pytest.mark.skipif('fork' not in multiprocessing.get_all_start_methods(), reason='no fork')
-def test_threads_are_started_anew_in_a_forked_process():
-    def add():
-        queue.put(sum(map_halves(lambda first, after: after - first, 100)))
+@pytest.mark.parametrize('threads', [2], indirect=True)
+def test_threads_are_started_anew_in_a_forked_process(threads):
+    def meet():
+        barrier = threading.Barrier(2, timeout=20)
+        queue.put(sorted(map_halves(lambda first, after: barrier.wait(), 100)))
 
     context = multiprocessing.get_context('fork')
     queue = context.Queue()
-    child = context.Process(target=add, daemon=True)
-    for begin in (add, child.start):
+    child = context.Process(target=meet, daemon=True)
+    for begin in (meet, child.start):
         begin()
-        assert queue.get(timeout=30) == 100
+        assert queue.get(timeout=30) == [0, 1]
     child.join()
