@@ -20,11 +20,6 @@ from rangeseg_ros.messages.make import CLOUD
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
 
 
-def read(path):
-    with DepthBag(path) as bag:
-        return list(bag)
-
-
 @pytest.mark.parametrize('compressed', [False, True])
 @pytest.mark.parametrize('storage', SUFFIXES)
 def test_every_format_gives_the_frames(tmp_path, storage, compressed):
@@ -48,10 +43,11 @@ def test_parts_of_a_recording_are_read_in_order(tmp_path):
     for index, image in enumerate(images):
         part = record(tmp_path / f'part{index}', 'mcap', image[None])
         part.rename(tmp_path / f'bag/bag_{index}.mcap')
-    np.testing.assert_array_equal([f.depth for f in read(tmp_path / 'bag')], images)
+    with DepthBag(tmp_path / 'bag') as bag:
+        np.testing.assert_array_equal([frame.depth for frame in bag], images)
 
 
-def test_depth_is_found_by_name_among_other_images(tmp_path):
+def test_depth_is_found_by_name_or_else_by_encoding(tmp_path):
     recording = Recording()
     recording.add_image(1, np.zeros((48, 192), np.uint8), 'rgb8', '/camera/color/image_raw')
     recording.add_image(1, depth_images(1)[0], 'mono16', '/camera/infra/image_raw')
@@ -64,30 +60,21 @@ def test_depth_is_found_by_name_among_other_images(tmp_path):
         assert (bag.depth_topic, bag.camera_topic) == (DEPTH, INFO)
     with DepthBag(tmp_path / 'bag', f'{DEPTH}/compressedDepth') as bag:
         assert bag.camera_topic == INFO
-
-
-def test_depth_is_found_by_encoding_where_no_name_tells(tmp_path):
     recording = Recording()
     recording.add_image(1, np.zeros((48, 192), np.uint8), 'rgb8', '/a/image')
     recording.add_image(1, np.ones((48, 64), np.float32), '32FC1', '/b/image')
     recording.add_camera(1, topic='/camera_info')
-    recording.write(tmp_path / 'bag')
-    with DepthBag(tmp_path / 'bag') as bag:
+    recording.write(tmp_path / 'unnamed')
+    with DepthBag(tmp_path / 'unnamed') as bag:
         assert (bag.depth_topic, bag.camera_topic) == ('/b/image', '/camera_info')
 
 
-@pytest.mark.parametrize(
-    ('topic', 'raw'),
-    [
-        ('/camera/depth/image_raw', True),
-        ('/depth/Image_RAW/compressedDepth', True),
-        ('/raw/image_rect_raw', False),
-        ('/depth/image_rect/compressed', False),
-        ('/rect/depth_raw/image', None),
-    ],
-)
-def test_images_are_raw_or_rectified_by_name(topic, raw):
-    assert raw_by_name(topic) is raw
+def test_images_are_raw_or_rectified_by_name():
+    assert raw_by_name('/camera/depth/image_raw') is True
+    assert raw_by_name('/depth/Image_RAW/compressedDepth') is True
+    assert raw_by_name('/raw/image_rect_raw') is False
+    assert raw_by_name('/depth/image_rect/compressed') is False
+    assert raw_by_name('/rect/depth_raw/image') is None
 
 
 @pytest.mark.parametrize('name', ['bag', 'ros1.bag'])
@@ -115,25 +102,29 @@ def test_camera_changes_on_the_way(tmp_path):
     recording.add_camera(4, focal=60.0)
     recording.add_image(5, images[2])
     recording.write(tmp_path / 'bag')
-    assert [frame.camera.fx for frame in read(tmp_path / 'bag')] == [50.0, 50.0, 60.0]
+    with DepthBag(tmp_path / 'bag') as bag:
+        assert [frame.camera.fx for frame in bag] == [50.0, 50.0, 60.0]
 
 
 def test_errors_list_the_topics_and_encodings(tmp_path):
-    recording, colour = Recording(), Recording()
+    recording = Recording()
     recording.add_camera(1, topic='/left/camera_info')
     recording.add_camera(1, topic='/right/camera_info')
     recording.write(tmp_path / 'cameras')
     recording.add_image(1, depth_images(1)[0])
     recording.write(tmp_path / 'both')
-    colour.add_camera(1)
-    colour.add_image(1, np.zeros((48, 64), np.uint8), '8UC1')
-    colour.write(tmp_path / 'colour')
+    for name, rows, kind, encoding in (('colour', 48, 'u1', '8UC1'), ('small', 20, 'u2', '16UC1')):
+        recording = Recording()
+        recording.add_camera(1)
+        recording.add_image(1, np.zeros((rows, 64), kind), encoding)
+        recording.write(tmp_path / name)
     for name, topics, message in (
         ('cameras', (), r'no depth image; topics: /left/camera_info \[sensor_msgs'),
         ('both', (), r'no camera_info for .*/right/camera_info'),
         ('both', ('/nowhere',), r'no depth image on /nowhere; topics: /camera'),
         ('both', (None, '/nowhere'), r'no camera_info on /nowhere; topics: /camera'),
         ('colour', (), r'no depth image \(/camera/depth/image_rect: 8UC1\)'),
+        ('small', (), 'depth image is 64x20, its camera 64x48'),
     ):
         with pytest.raises(BagError, match=message):
             DepthBag(tmp_path / name, *topics)

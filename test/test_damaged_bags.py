@@ -24,11 +24,9 @@ def test_a_recording_without_its_end_gives_the_frames_before(tmp_path, share):
     frames = []
     with DepthBag(path) as bag:
         count = len(bag)
-        with pytest.raises(
-            DamagedBagError, match=f'damaged after {count} frames: without its end: '
-        ):
-            for frame in bag:
-                frames.append(frame)
+        said = f'damaged after {count} frames: without its end: '
+        with pytest.raises(DamagedBagError, match=said):
+            frames.extend(bag)
     assert len(frames) == count
     # What was cut through is lost: an image, or the chunk of at most 1 MB that it is in.
     assert 40 * share - 9 <= count <= 40 * share
@@ -68,37 +66,27 @@ def numbers_of(path, **options):
     return numbers, bag
 
 
+CAMERA, IMAGE = -2, -1
+"""Messages of the last frame of a recording."""
+SHORT = IMAGE, 'data', np.zeros(100, np.uint8)
+
+
 def with_bad_frame(path, bad, number=3, count=6):
-    """Record frames, one of them spoilt by `bad(recording, stamp, image)`."""
+    """Record frames, one of them spoilt: (message, field, value)."""
+    message, *change = bad
     recording = Recording(ros1=path.suffix == '.bag')
     for index, image in enumerate(depth_images(count)):
         recording.add_camera(stamp_of(index))
-        add = bad if index == number else Recording.add_image
-        add(recording, stamp_of(index), image)
-    return recording.write(path)
-
-
-def colour(recording, stamp, image):
-    recording.add_image(stamp, np.zeros((48, 192), np.uint8), 'rgb8')
-
-
-def short(recording, stamp, image):
-    recording.add_image(stamp, image)
-    recording.messages[-1][-1].data = recording.messages[-1][-1].data[:100]
-
-
-def small(recording, stamp, image):
-    recording.add_image(stamp, image[:20])
-
-
-def bad_camera(recording, stamp, image):
-    recording.messages.pop()
-    recording.add_camera(stamp, focal=np.nan)
-    recording.add_image(stamp, image)
+        recording.add_image(stamp_of(index), image)
+        if index == number:
+            setattr(recording.messages[message][-1], *change)
+    recording.write(path)
 
 
 @pytest.mark.parametrize('number', [0, 3, 5])
-@pytest.mark.parametrize('bad', [colour, short, small, bad_camera])
+@pytest.mark.parametrize(
+    'bad', [(IMAGE, 'encoding', 'rgb8'), SHORT, (IMAGE, 'height', 20), (CAMERA, 'width', 0)]
+)
 @pytest.mark.parametrize('name', ['bag', 'ros1.bag'])
 def test_one_bad_frame_costs_one_frame(tmp_path, bad, number, name):
     with_bad_frame(tmp_path / name, bad, number)
@@ -109,7 +97,7 @@ def test_one_bad_frame_costs_one_frame(tmp_path, bad, number, name):
 
 
 def test_a_message_that_is_no_message_costs_one_frame(tmp_path):
-    file = with_bad_frame(tmp_path / 'bag', Recording.add_image)
+    file = record(tmp_path / 'bag', 'mcap', depth_images(6))
     data = bytearray(file.read_bytes())
     # The string of an encoding begins with its length.
     places = [i for i in range(len(data)) if data.startswith(b'16UC1', i)]
@@ -121,7 +109,7 @@ def test_a_message_that_is_no_message_costs_one_frame(tmp_path):
 
 
 def test_a_replay_leaves_out_a_bad_frame_and_says_so(tmp_path, run):
-    with_bad_frame(tmp_path / 'bag', short, number=2, count=4)
+    with_bad_frame(tmp_path / 'bag', SHORT, number=2, count=4)
     code, output, error = run('replay', tmp_path / 'bag', '--output', tmp_path / 'out')
     assert code == 1 and '3 frames' in output
     assert error.count('\n') == 2 and '1 of 4 frames left out' in error
@@ -133,14 +121,12 @@ def test_a_replay_leaves_out_a_bad_frame_and_says_so(tmp_path, run):
     assert code == 1 and 'done before' in output and 'left out' in error
 
 
-def spoil_chunk(file, number):
-    """Overwrite the begin of the compressed content of a chunk of an mcap file."""
-    data, position = bytearray(file.read_bytes()), 8
-    while number or data[position] != 6:
-        number -= data[position] == 6
-        position += 9 + struct.unpack_from('<Q', data, position + 1)[0]
-    data[position + 49 : position + 1049] = bytes(1000)
-    file.write_bytes(data)
+def records(data):
+    """Places and kinds of the records of an mcap file."""
+    place = 8
+    while place < len(data) - 8:
+        yield place, data[place]
+        place += 9 + struct.unpack_from('<Q', data, place + 1)[0]
 
 
 @pytest.fixture
@@ -155,7 +141,11 @@ def packed(tmp_path):
 
 def test_a_damaged_chunk_costs_the_chunk_and_copies_leave_it_out(packed, tmp_path, run):
     assert numbers_of(tmp_path / 'bag')[0] == list(range(8))
-    spoil_chunk(packed, 2)
+    data = bytearray(packed.read_bytes())
+    # The begin of the compressed content of the third chunk.
+    content = [place for place, kind in records(data) if kind == 6][2] + 49
+    data[content : content + 1000] = bytes(1000)
+    packed.write_bytes(data)
     numbers, bag = numbers_of(tmp_path / 'bag')
     assert 6 <= len(numbers) < 8 and numbers[-1] == 7
     assert bag.lost.total() == 8 - len(numbers) and 'damaged chunk' in bag.loss()
@@ -164,25 +154,10 @@ def test_a_damaged_chunk_costs_the_chunk_and_copies_leave_it_out(packed, tmp_pat
     assert numbers_of(tmp_path / 'out/bag')[0] == numbers
 
 
-def test_bags_without_any_good_frame_are_refused(tmp_path):
-    recording = Recording()
-    recording.add_camera(1)
-    small(recording, 2, depth_images(1)[0])
-    recording.write(tmp_path / 'bag')
-    with pytest.raises(BagError, match='64x20'):
-        DepthBag(tmp_path / 'bag')
-
-
-def without_index(whole):
-    """An mcap whose footer says that there is no index."""
-    place = 8
-    while whole[place] not in (2, 15):  # footer, or the end of the data
-        place += 9 + struct.unpack_from('<Q', whole, place + 1)[0]
-    return whole[:place] + struct.pack('<BQQQI', 2, 20, 0, 0, 0) + whole[-8:]
-
-
 def test_an_mcap_without_an_index_is_read_to_its_end(packed):
-    packed.write_bytes(without_index(packed.read_bytes()))
+    whole = packed.read_bytes()
+    end = next(place for place, kind in records(whole) if kind in (2, 15))  # of the data, or all
+    packed.write_bytes(whole[:end] + struct.pack('<BQQQI', 2, 20, 0, 0, 0) + whole[-8:])
     numbers, bag = numbers_of(packed)
     assert numbers == list(range(8)) and not bag.loss()
 
