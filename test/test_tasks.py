@@ -19,14 +19,18 @@ pytestmark = pytest.mark.slow
 
 @dataclass(frozen=True)
 class Square:
+    """Its workers die so many times where its `runs` are counted, by the size of a file."""
+
     number: int
-    folder: Path | None = None
+    runs: Path | None = None
+    deaths: int = 1
 
     def run(self):
-        # Its worker dies the first time.
-        if self.folder and not (mark := self.folder / f'{self.number}').exists():
-            mark.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
+        if self.runs:
+            with self.runs.open('a') as file:
+                print(file=file)
+            if self.runs.stat().st_size <= self.deaths:
+                os.kill(os.getpid(), signal.SIGKILL)
         return self.number**2
 
 
@@ -36,11 +40,6 @@ class Raises:
 
     def run(self):
         raise self.error
-
-
-class Deadly:
-    def run(self):
-        os.kill(os.getpid(), signal.SIGKILL)
 
 
 class Sleeps:
@@ -72,40 +71,38 @@ class LosesSignals:
 
 
 @dataclass(frozen=True)
-class RaisesOnceBegun:
+class FailsOnceBegun:
     folder: Path
+    dies: bool = False
 
     def run(self):
         wait_for((self.folder / 'begun').exists)
+        if self.dies:
+            os.kill(os.getpid(), signal.SIGKILL)
         raise KeyError('fault')
-
-
-class DiesOnceBegun(RaisesOnceBegun):
-    def run(self):
-        wait_for((self.folder / 'begun').exists)
-        os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_a_worker_that_loses_a_signal_is_told_again_but_not_while_it_puts_away(tmp_path):
     with pytest.raises(KeyError, match='fault'):
-        list(attempt_all([LosesSignals(tmp_path), RaisesOnceBegun(tmp_path)], 2))
+        list(attempt_all([LosesSignals(tmp_path), FailsOnceBegun(tmp_path)], 2))
     assert (tmp_path / 'put away').exists()
 
 
 def test_a_worker_that_loses_a_signal_ends_where_another_dies(tmp_path):
     # A result first: the pool waits for a worker just started only from its next result on.
-    tasks = [LosesSignals(tmp_path), Square(2), DiesOnceBegun(tmp_path)]
+    tasks = [LosesSignals(tmp_path), Square(2), FailsOnceBegun(tmp_path, dies=True)]
     assert [type(result) for result in attempt_all(tasks, 2)] == [type(None), int, Failure]
     assert (tmp_path / 'put away').exists()
 
 
 def test_results_come_in_order_whatever_workers_die(tmp_path):
-    """A task that kills every worker is given up."""
-    tasks = [Square(0), Square(1, tmp_path), Deadly(), Square(3, tmp_path), Square(4), Square(5)]
-    results = list(attempt_all(tasks, 2))
-    given_up = results.pop(2)
-    assert results == [0, 1, 9, 16, 25]
-    assert isinstance(given_up, Failure) and '2 workers' in str(given_up.error)
+    tasks = [Square(0), Square(1, tmp_path / '1'), Square(2), Square(3, tmp_path / '3'), Square(4)]
+    assert list(attempt_all(tasks, 2)) == [0, 1, 4, 9, 16]
+    # What kills every worker is given up: once beside another task, and twice alone.
+    deadly = Square(5, tmp_path / '5', deaths=9)
+    given_up, other = attempt_all([deadly, Square(6)], 2)
+    assert isinstance(given_up, Failure) and '2 workers' in str(given_up.error) and other == 36
+    assert deadly.runs.stat().st_size == 3
 
 
 @pytest.mark.parametrize('jobs', [1, 2])
@@ -134,7 +131,8 @@ def test_workers_end_with_their_parent(tmp_path, name):
     program.write_text(PARENT.format(folder=str(Path(__file__).parent)))
     parent = subprocess.Popen([sys.executable, program], stderr=subprocess.DEVNULL)
     try:
-        workers = wait_for(lambda: len(found := descendants(parent.pid)) >= 2 and found)
+        threads = Path(f'/proc/{parent.pid}/task')
+        workers = wait_for(lambda: len(found := children(threads)) >= 2 and found)
         time.sleep(2)
         parent.send_signal(getattr(signal, name))
         parent.wait(20)
@@ -143,14 +141,9 @@ def test_workers_end_with_their_parent(tmp_path, name):
         parent.kill()
 
 
-def descendants(parent):
-    """Processes whose parent this is."""
-    found = []
-    for stat in Path('/proc').glob('[0-9]*/stat'):
-        with suppress(OSError):
-            if int(stat.read_text().rpartition(')')[2].split()[1]) == parent:
-                found.append(int(stat.parent.name))
-    return found
+def children(threads):
+    """Processes that threads have started."""
+    return [child for path in threads.glob('*/children') for child in path.read_text().split()]
 
 
 def alive(process):
