@@ -61,6 +61,17 @@ def refused(run):
     return run_command
 
 
+@pytest.fixture(scope='session')
+def seen():
+    """Frame of a simulated room, as a Kinect sees it."""
+    # Not all tests wait for the simulation to be imported.
+    from rangeseg_ros.simulation.render import simulate
+    from rangeseg_ros.simulation.scenes import kinect_room
+    from rangeseg_ros.simulation.sensors.catalogue import SENSORS
+
+    return simulate(kinect_room(3), SENSORS['kinect'](1), seed=3)
+
+
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """Working folder with camera.yaml and two depth images, one of them of a wall."""

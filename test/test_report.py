@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from types import SimpleNamespace
 from urllib.parse import quote, unquote
+from urllib.request import urlopen
 
 import cv2
 import numpy as np
@@ -20,8 +21,6 @@ from rangeseg_ros.report import charts
 from rangeseg_ros.report.page import MAX_PICTURES, Picture, evenly_spaced
 from rangeseg_ros.report.replay import ReplayReport
 
-CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
-
 
 def sources_and_text(path):
     """What a page loads or links to, and what it says."""
@@ -30,29 +29,28 @@ def sources_and_text(path):
     return re.findall(' (?:src|href)="(.*?)"', tags), html.unescape(re.sub('<[^>]*>', '', page))
 
 
-@pytest.fixture
-def report(tmp_path):
-    """Page of three frames of walls and one without a measurement."""
-    config = Config(min_pixels=499)
+def test_a_page_is_self_contained_and_says_what_was_found(tmp_path):
+    """Of three frames of walls and one without a measurement, whose picture is gone."""
+    config, path = Config(min_pixels=499), tmp_path / 'report.html'
     sequence = SequenceSegmenter(config)
-    page = ReplayReport('<script>alert(1)</script>', config)
+    report = ReplayReport('<script>alert(1)</script>', config)
     for index, depth in enumerate([*walls(3), np.zeros((48, 64), np.uint16)]):
-        image = RangeImage.from_depth(depth, CAMERA)
+        image = RangeImage.from_depth(depth, Camera(64, 48, 50.0, 50.0, 31.5, 23.5))
         stamp = 10**18 + index * 500_000_000
         # The last frame has not come to the labels.
         times = {'edges': 2.0} | ({'labels': (10.0, 20.0, 40.0)[index]} if index < 3 else {})
         result = replace(sequence.segment(image, stamp), timings=times)
         files = write_frame(tmp_path, f'{index}', image, result, ['overlay'])
-        page.add(stamp, result, files['overlay'])
-    page.write(tmp_path / 'report.html', 'file ends within a record')
-    return tmp_path / 'report.html'
-
-
-def test_a_page_is_self_contained_and_says_what_was_found(report):
-    sources, text = sources_and_text(report)
-    page = report.read_text()
+        report.add(stamp, result, files['overlay'])
+    files['overlay'].unlink()
+    report.write(path, 'file ends within a record')
+    sources, text = sources_and_text(path)
+    page = path.read_text()
     assert len(sources) == 4 + 2  # overlays, charts
     assert all(source.startswith('data:image/') for source in sources)
+    pictures = [np.frombuffer(urlopen(source).read(), np.uint8) for source in sources[:4]]
+    shapes = [cv2.imdecode(picture, cv2.IMREAD_UNCHANGED).shape for picture in pictures]
+    assert shapes == [(48, 64, 3)] * 3 + [(1, 1, 3)]
     assert not re.search(r'url\(|@import|<link', page)
     assert '4 frames in 1.5 s, 2 planes in the median frame, 2 ids in all' in text
     assert 'file ends within a record' in text
