@@ -83,10 +83,5 @@ def test_the_page_has_a_row_for_each_mechanism(frame, monkeypatch, tmp_path):
     page = tmp_path / 'ledger.md'
     ablate.main(['--only', '^(curved regions told|method normals)$', '--output', str(page)])
     rows = [line for line in page.read_text().splitlines() if line.startswith('| ')]
-    assert [row.split(' | ')[0] for row in rows] == [
-        '| mechanism',
-        '| ---',
-        '| with all',
-        '| curved regions told',
-        '| method normals (an option)',
-    ]
+    names = 'mechanism', '---', 'with all', 'curved regions told', 'method normals (an option)'
+    assert [row.split(' | ')[0] for row in rows] == [f'| {name}' for name in names]

@@ -43,21 +43,17 @@ def temporary_file(*arguments, dir=None, **options):
 tempfile.TemporaryFile = temporary_file
 tempfile.tempdir = allowed or '/proc'
 """
-KERNEL = """
-from rangeseg_ros.core.by_normals.labelling import degrees
-degrees(1.0)
-"""
-
-
+KERNEL = 'from rangeseg_ros.core.by_normals.labelling import degrees\ndegrees(1.0)'
 # Prints when it is unpickled, as numba does with what it finds.
 CODE_IN_A_PICKLE = 2 * b"cbuiltins\nprint\n(S'poison'\ntR."
+INHERITED = {k: v for k, v in os.environ.items() if k != 'NUMBA_CACHE_DIR'}
+KEPT, CACHE = 'NUMBA_CACHE_DIR', 'XDG_CACHE_HOME'
 
 
 def run_restricted(code, allowed='', **environment):
     """Run Python where only one folder can be written to, or none."""
-    inherited = {k: v for k, v in os.environ.items() if k != 'NUMBA_CACHE_DIR'}
-    home = {'HOME': '/proc/none', 'XDG_CACHE_HOME': '/proc/none'}
-    return python(RESTRICT + code, allowed, cwd=ROOT, env={**inherited, **home, **environment})
+    home = {'HOME': '/proc/none', CACHE: '/proc/none'}
+    return python(RESTRICT + code, allowed, cwd=ROOT, env={**INHERITED, **home, **environment})
 
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason='PYTHONSAFEPATH is of Python 3.11')
@@ -86,27 +82,22 @@ def test_where_nothing_can_be_written_one_line_says_so(start):
 
 
 @pytest.mark.parametrize(
-    ('variable', 'within', 'mode'),
-    [
-        ('NUMBA_CACHE_DIR', '', 0o777),
-        ('NUMBA_CACHE_DIR', '', 0o1777),
-        ('NUMBA_CACHE_DIR', '', 0o755),
-        ('XDG_CACHE_HOME', 'rangeseg_ros', 0o777),
-    ],
+    ('variable', 'mode'), [(KEPT, 0o777), (KEPT, 0o1777), (KEPT, 0o755), (CACHE, 0o777)]
 )
 def test_folders_that_the_user_names_come_first_but_where_others_can_write(
-    tmp_path, variable, within, mode
+    tmp_path, variable, mode
 ):
     """What is unpickled from there is executed."""
     named = tmp_path / 'named'
+    within = named / 'rangeseg_ros' if variable == CACHE else named
     run = run_restricted(KERNEL, tmp_path, **{variable: os.fspath(named)})
     assert (run.returncode, run.stderr) == (0, '')
-    indices = [*(named / within).rglob('*.nbi')]
+    indices = [*within.rglob('*.nbi')]
     assert indices
     for index in indices:
         index.write_bytes(CODE_IN_A_PICKLE)
     if mode == 0o755:  # as if somebody else had made it
-        (state,) = (named / within).glob('rangeseg_ros-*')
+        (state,) = named.glob('rangeseg_ros-*')
         state.chmod(0o777)
     named.chmod(mode)
     run = run_restricted(KERNEL, tmp_path, **{variable: os.fspath(named)})
@@ -114,7 +105,7 @@ def test_folders_that_the_user_names_come_first_but_where_others_can_write(
     # Of a folder that is the user's in one that all may write to, as /tmp, nobody can change it.
     assert ('poison' in run.stdout) == (mode == 0o1777)
     told = 'is not used' in run.stderr
-    assert told == (variable == 'NUMBA_CACHE_DIR' and mode != 0o1777)
+    assert told == (variable == KEPT and mode != 0o1777)
 
 
 @pytest.mark.parametrize(
@@ -177,9 +168,7 @@ def test_kernels_are_compiled_anew_when_what_they_call_has_changed(tmp_path):
         (package / f'{name}.py').write_text(text)
 
     def call():
-        environment = {k: v for k, v in os.environ.items() if k != 'NUMBA_CACHE_DIR'}
-        environment['PYTHONPATH'] = os.fspath(ROOT)
-        done = python(CALL, cwd=tmp_path, env=environment)
+        done = python(CALL, cwd=tmp_path, env={**INHERITED, 'PYTHONPATH': os.fspath(ROOT)})
         return done.stdout.split() or done.stderr
 
     assert call() == ['1', '3', '0', '0']

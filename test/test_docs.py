@@ -91,9 +91,8 @@ def test_the_tutorial_can_be_followed(tmp_path, monkeypatch, run):
     pyplot.switch_backend('agg')
     monkeypatch.chdir(tmp_path)
     text = (ROOT / 'docs/tutorial.md').read_text()
-    Path('up.yaml').write_text(
-        '\n'.join(re.findall(r'^    (.*(?:segment_planes:|up_.*))$', text, re.M))
-    )
+    lines = re.findall(r'^    (.*(?:segment_planes:|up_.*))$', text, re.M)
+    Path('up.yaml').write_text('\n'.join(lines))
     for words in shown_commands('docs/tutorial.md'):
         assert run(*words)[0] == 0, words
     (code,) = re.findall(r'```python\n(.*?)```', text, re.S)
@@ -121,8 +120,7 @@ def test_recipes_for_data_run(tmp_path, monkeypatch, run, seen):
     write_image(tum / 'depth/1305031453.374112.png', 5 * seen.depth)
     write_image(tum / 'rgb/1305031453.374112.png', np.zeros((480, 640, 3), np.uint8))
     (tum / 'depth.txt').write_text('# depth\n1305031453.374112 depth/1305031453.374112.png\n')
-    packed = run('pack', scenes, '--camera', 'camera.yaml', '--output', 'recording.bag')
-    assert packed[0] == 0
+    assert run('pack', scenes, '--camera', 'camera.yaml', '--output', 'recording.bag')[0] == 0
     for number, words in enumerate(shown_commands('docs/your-data.md')):
         if '0.0002' in words:
             words[1] = str(tum / 'depth/1305031453.374112.png')
@@ -141,13 +139,10 @@ def test_every_column_of_planes_and_every_topic_is_explained():
     text = (ROOT / 'docs/ros.md').read_text()
     for topic in (*OUTPUTS, *MAP_OUTPUTS):
         assert f'`~/{topic}`' in text, topic
-
-
-def test_settings_of_nav2_are_yaml_and_name_topics():
+    # The settings of Nav2 are YAML and name topics.
     for text in re.findall(r'```yaml\n(.*?)```', (ROOT / 'docs/navigation.md').read_text(), re.S):
-        assert yaml.safe_load(text)
         topics = re.findall(r'/segment_planes/(\w+)', text)
-        assert topics and set(topics) <= set(OUTPUTS)
+        assert yaml.safe_load(text) and topics and set(topics) <= set(OUTPUTS)
 
 
 def test_the_notebook_runs():
@@ -168,10 +163,7 @@ def test_every_room_is_on_the_page_of_the_architecture():
                 assert f'`{path.name}/`' in text, path.name
             elif path.suffix == '.py' and path.name != '__init__.py':
                 assert f'`{path.name}`' in text, path.name
-
-
-def test_functions_that_the_architecture_names_are_where_it_says():
-    text = (ROOT / 'docs/architecture.md').read_text()
+    # Functions are where it says.
     pairs = re.findall(r'`(\w+)`(?:\(\))? (?:\(|in |of )`([\w/]+\.py)`', text)
     assert len(pairs) > 5
     for name, file in pairs:
@@ -218,9 +210,8 @@ def constants():
                 or isinstance(getattr(after, 'value', None), ast.Constant)
             )
             (target,), value = statement.targets, statement.value
-            pairs = [(target, value)]
-            if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple):
-                pairs = zip(target.elts, value.elts, strict=True)
+            several = isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple)
+            pairs = zip(target.elts, value.elts, strict=True) if several else [(target, value)]
             for target, value in pairs:
                 known = getattr(target, 'id', '')
                 if known.isupper() and numeric(getattr(module, known)):

@@ -92,14 +92,10 @@ def test_planes_of_most_area_over_time_are_charted():
     assert charts.longest_seen(seen, 9).tolist() == [9, 7, 5]
 
 
-@pytest.fixture
-def times(monkeypatch):
-    """Seconds of frames; charts give their figure."""
+def test_bars_and_lines_break_where_a_plane_is_out_of_sight(monkeypatch):
+    """Bars are as long as planes are in sight, drifts are told from medians."""
     monkeypatch.setattr(charts, 'svg', lambda figure: figure)
-    return np.arange(10) * 0.5
-
-
-def test_bars_are_as_long_as_planes_are_in_sight(times):
+    times = np.arange(10) * 0.5
     seen = sightings(*((frame, number, 1.0, 2.0) for frame in (1, 2, 4) for number in (4, 9)))
     figure = charts.id_bars(seen, times)
     (axes,) = figure.axes
@@ -110,9 +106,6 @@ def test_bars_are_as_long_as_planes_are_in_sight(times):
         assert spans == [[0.5, row - 0.4, 1.5, row + 0.4], [2.0, row - 0.4, 2.5, row + 0.4]]
     (bars,) = charts.id_bars(sightings((0, 4, 1.0, 2.0)), times[:1]).axes[0].collections
     assert bars.get_paths()[0].get_extents().width == 1
-
-
-def test_drifts_are_told_from_medians_and_break_where_a_plane_is_out_of_sight(times):
     seen = sightings((0, 5, 1.0, 2.0), (1, 5, 1.0, 2.01), (4, 5, 1.0, 2.03))
     seen['normal'][1] = 0.0, np.sin(0.02), -np.cos(0.02)
     shown, degrees = charts.drifts(seen, times).axes, np.degrees(0.02)
@@ -166,14 +159,11 @@ def test_unlabelled_pixels_stay_grey_and_labelled_ones_have_their_colour():
     assert (inner == inner[0]).all()
     mixed = 0.45 * grey(inverse)[6, 6] + 0.55 * colours([3])[0].astype(float)
     np.testing.assert_allclose(inner[0], mixed, atol=0.51)
-
-
-def test_colours_follow_ids_not_labels():
-    inverse, ones = np.full((20, 30), 0.5, np.float32), np.ones((20, 30), np.uint16)
-    planes = [SimpleNamespace(label=label, id=9) for label in (1, 2)]
-    first, second = (overlay(inverse, plane.label * ones, [plane]) for plane in planes)
+    # Colours follow ids, not labels.
+    planes = [SimpleNamespace(label=label, id=9) for label in (1, 3)]
+    first, second = (overlay(inverse, labels // 3 * plane.label, [plane]) for plane in planes)
     np.testing.assert_array_equal(first, second)
-    assert (first != overlay(inverse, ones)).any()
+    assert (first != picture).any()
 
 
 def test_an_id_is_written_where_its_region_is_widest():

@@ -172,12 +172,9 @@ def loop():
 main.rangeseg = click.Command('rangeseg', callback=loop)
 main.main()
 """
-LOST = """try: os.kill(os.getpid(), signal.SIGINT); sum(range(9))
-        except KeyboardInterrupt: pass"""
-WRAPPED = """try: os.kill(os.getpid(), signal.SIGINT); sum(range(9))
-        except KeyboardInterrupt as error: raise SystemError('in a kernel') from error"""
-MISTAKEN = """try: os.kill(os.getpid(), signal.SIGINT); sum(range(9))
-        except KeyboardInterrupt: raise ValueError('not a bag')"""
+KILLED = """try: os.kill(os.getpid(), signal.SIGINT); sum(range(9))
+        except KeyboardInterrupt as error: {}"""
+LOST = KILLED.format('pass')
 IN_A_CALLBACK = """ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGINT))()"""
 BESIDE_A_THREAD_THAT_WAITS = """threading.Thread(target=threading.Event().wait).start()
         os.kill(os.getpid(), signal.SIGINT)"""
@@ -187,8 +184,8 @@ BESIDE_A_THREAD_THAT_WAITS = """threading.Thread(target=threading.Event().wait).
     ('body', 'name', 'code'),
     [
         (LOST, 'SIGINT', 130),
-        (WRAPPED, 'SIGINT', 130),
-        (MISTAKEN, 'SIGTERM', 143),
+        (KILLED.format("raise SystemError('in a kernel') from error"), 'SIGINT', 130),
+        (KILLED.format("raise ValueError('not a bag')"), 'SIGTERM', 143),
         (IN_A_CALLBACK, 'SIGTERM', 143),
         (LOST, 'SIGHUP', 129),
         (BESIDE_A_THREAD_THAT_WAITS, 'SIGINT', 130),
