@@ -60,32 +60,22 @@ class Recording:
         message = self.store.types[COMPRESSED](self.header(stamp), format, data)
         self.messages.append((stamp, f'{DEPTH}/compressedDepth', COMPRESSED, message))
 
-    def add_camera(
-        self, stamp, width=64, height=48, focal=50.0, topic=INFO, model='plumb_bob', **changes
-    ):
+    def add_camera(self, stamp, width=64, height=48, focal=50.0, topic=INFO, **changes):
         k = changes.get('k', np.array([focal, 0, 31.5, 0, focal, 23.5, 0, 0, 1]))
-        matrices = {'d': np.zeros(5), 'k': k, 'r': np.eye(3).ravel()}
-        matrices |= {'p': np.insert(k, (3, 6, 9), 0.0), **changes}
-        if self.ros1:
-            matrices = {name.upper(): matrix for name, matrix in matrices.items()}
+        p, r = np.insert(k, (3, 6, 9), 0.0), np.eye(3).ravel()
+        # In the order of the message, in which ROS 1 has capitals.
+        matrices = {'d': np.zeros(5), 'k': k, 'r': r, 'p': p} | changes
         roi = self.store.types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False)
-        whole = {'binning_x': 0, 'binning_y': 0, 'roi': roi}
-        message = self.store.types[CAMERA_INFO](
-            self.header(stamp), height, width, model, **matrices, **whole
-        )
-        self.messages.append((stamp, topic, CAMERA_INFO, message))
+        layout = self.header(stamp), height, width, 'plumb_bob', *matrices.values(), 0, 0, roi
+        self.messages.append((stamp, topic, CAMERA_INFO, self.store.types[CAMERA_INFO](*layout)))
 
     def add_transform(self, stamp, parent, child, rotation, shift, kind=TF, static=False):
         """A transform of one moment, or for all; rotation x, y, z, w."""
-        types = self.store.types
-        transform = types['geometry_msgs/msg/Transform'](
-            rotation=types['geometry_msgs/msg/Quaternion'](*rotation),
-            translation=types['geometry_msgs/msg/Vector3'](*shift),
-        )
-        stamped = types['geometry_msgs/msg/TransformStamped'](
-            self.header(stamp, parent), child, transform
-        )
-        message = types[kind](transforms=[stamped])
+        names = 'Vector3', 'Quaternion', 'Transform', 'TransformStamped'
+        vector, turn, both, stamped = (self.store.types[f'geometry_msgs/msg/{n}'] for n in names)
+        transform = both(translation=vector(*shift), rotation=turn(*rotation))
+        transforms = [stamped(self.header(stamp, parent), child, transform)]
+        message = self.store.types[kind](transforms=transforms)
         self.messages.append((stamp, '/tf_static' if static else '/tf', kind, message))
 
     def write(self, path, storage='mcap'):

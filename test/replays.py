@@ -13,10 +13,10 @@ DELAY = 5_000_000
 """Nanoseconds from the stamp of a message to its recording."""
 
 
-def walls(count, height=48, width=64):
-    """A near wall on the left, a far one on the right: (count, H, W) uint16 millimetres."""
-    depth = np.full((count, height, width), 2500, np.uint16)
-    depth[:, :, : width // 2] = 1500
+def walls(count):
+    """A near wall on the left, a far one on the right: (count, 48, 64) uint16 millimetres."""
+    depth = np.full((count, 48, 64), 2500, np.uint16)
+    depth[:, :, :32] = 1500
     return depth + np.arange(count, dtype=np.uint16)[:, None, None]
 
 

@@ -34,25 +34,14 @@ FOLDERS = [ROOT, PACKAGE, PACKAGE / 'core', ROOT / 'docs', ROOT / 'test']
 
 
 @pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
-def test_links_and_names_of_files_lead_somewhere(page):
+def test_links_files_commands_and_their_options_exist(page):
     text = page.read_text()
     for link in re.findall(r'\]\(([^)#:]+)(?:#[^)]*)?\)', text):
         assert (page.parent / link).exists() or link in GENERATED, link
     for name in re.findall(r'`((?:[\w.]+/)*\w+\.(?:py|md|toml|cff|rst))`', text):
         nested = [folder / name for folder in FOLDERS]
         assert any(path.exists() for path in nested) or any(PACKAGE.rglob(name)), name
-
-
-def test_the_python_interface_is_listed():
-    rows = re.findall(r'^\| `(\w+)` \| (.*) \|$', (ROOT / 'docs/api.md').read_text(), re.M)
-    assert {name for name, _ in rows} == {*rangeseg_ros.__all__} - {'__version__'}
-    for name, text in rows[:-1]:
-        assert text == getattr(rangeseg_ros, name).__doc__.splitlines()[0]
-
-
-@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
-def test_commands_and_their_options_exist(page):
-    text = page.read_text().replace('\\\n', ' ')
+    text = text.replace('\\\n', ' ')
     told = re.findall(r'^(?:    |RUN .*&& )rangeseg ([^\n]+)|`rangeseg ([^`]+)`', text, re.M)
     for words in told:
         command, context = rangeseg, click.Context(rangeseg)
@@ -64,6 +53,13 @@ def test_commands_and_their_options_exist(page):
             context = click.Context(command, parent=context)
         with suppress(click.BadOptionUsage):  # named alone, without what it takes
             command.make_parser(context).parse_args(words)
+
+
+def test_the_python_interface_is_listed():
+    rows = re.findall(r'^\| `(\w+)` \| (.*) \|$', (ROOT / 'docs/api.md').read_text(), re.M)
+    assert {name for name, _ in rows} == {*rangeseg_ros.__all__} - {'__version__'}
+    for name, text in rows[:-1]:
+        assert text == getattr(rangeseg_ros, name).__doc__.splitlines()[0]
 
 
 @pytest.mark.parametrize('page', ['README.md', 'docs/python.md', 'docs/your-data.md'])

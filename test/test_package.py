@@ -58,9 +58,7 @@ def test_every_library_that_may_be_missing_is_in_its_extra(setup_arguments):
         wanted = packages.get(name, name)
         assert any(re.match(rf'{wanted}\b', requirement) for requirement in extras[extra]), name
         assert not any(re.match(wanted, asked) for asked in setup_arguments['install_requires'])
-
-
-def test_segmenting_needs_no_library_of_an_extra():
+    # Segmenting needs none of them.
     modules = 'cli.segment', 'cli.compile', 'notebook', 'core.sequence'
     code = ''.join(f'import rangeseg_ros.{name}\n' for name in modules)
     code += f'import sys; print(*set(sys.modules) & {set(EXTRAS)!r})'
