@@ -2,6 +2,7 @@
 
 import functools
 import os
+import re
 import sys
 from dataclasses import replace
 from importlib import import_module
@@ -12,7 +13,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from clouds import cloud_of
-from numba import types
 from processes import python
 
 from rangeseg_ros import Config, RangeImage
@@ -211,15 +211,6 @@ def test_frames_need_nothing_more(method):
                     SequenceSegmenter(chosen).segment(each, 0)
 
 
-def named(kind):
-    """Whether values of a type of numba's contain a named tuple."""
-    if isinstance(kind, types.Optional):
-        return named(kind.type)
-    if not isinstance(kind, types.BaseTuple):
-        return False
-    return isinstance(kind, types.BaseNamedTuple) or any(map(named, kind))
-
-
 @pytest.mark.parametrize('method', ['planes', 'normals'])
 def test_what_is_found_is_what_a_run_compiles(method):
     """And none returns a named tuple to Python.
@@ -237,7 +228,8 @@ def test_what_is_found_is_what_a_run_compiles(method):
     for kernel in found:
         compiled = getattr(import_module(kernel.module), kernel.name).overloads
         assert kernel.signature in compiled, kernel.name
-        assert not named(compiled[kernel.signature].signature.return_type), kernel.name
+        returned = str(compiled[kernel.signature].signature.return_type)
+        assert {*re.findall(r'(\w+)\(', returned)} <= {'array', 'Tuple', 'UniTuple'}, kernel.name
 
 
 def test_labels_and_planes_need_less():
