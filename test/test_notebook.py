@@ -3,6 +3,7 @@
 import json
 import sys
 from functools import partial
+from pathlib import Path
 
 import matplotlib
 import numpy as np
@@ -12,6 +13,8 @@ import rangeseg_ros
 from rangeseg_ros import Camera, CameraError, Config, ConfigError, RangeImage, Segmenter
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.extras import MissingExtraError, import_extra
+from rangeseg_ros.io.cameras import write_camera
+from rangeseg_ros.io.images import write_image
 
 
 @pytest.fixture(scope='module')
@@ -37,6 +40,17 @@ def test_texts_are_short(seen, result):
     assert f'{len(result.planes)} planes (' in repr(result) and f'wall {walls}' in repr(result)
     assert repr(Segmenter(Config(noise=0.001))) == 'Segmenter(Config(noise=0.001))'
     assert 'nothing' in repr(RangeImage.from_depth(np.zeros((480, 640)), seen.camera))
+
+
+def test_the_command_says_once_that_up_is_off(seen, folder, run):
+    write_camera(Path('camera.yaml'), seen.camera)
+    names = 'a.png', 'b.png'
+    for name in names:
+        write_image(Path(name), seen.depth)
+    segment = 'segment', '--camera', 'camera.yaml', '--output'
+    one, two = run(*segment, 'one', names[0])[2], run(*segment, 'two', *names)[2]
+    assert one.startswith('rangeseg: a.png: up as stated') and one.count('\n') == 1
+    assert two == f'{one}rangeseg: up is off in 2 images\n'
 
 
 def test_dictionaries_and_tables_hold_the_numbers(result):
