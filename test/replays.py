@@ -50,11 +50,8 @@ def rows_of(path):
 
 def results(folder):
     """Contents of the files that must not depend on who made them, or when."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob('*'))
-        if path.is_file() and path.suffix in ('.png', '.csv', '.mcap')
-    }
+    paths = [path for kind in ('png', 'csv', 'mcap') for path in folder.rglob(f'*.{kind}')]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
 def replay(recording, folder, **options):

@@ -55,17 +55,14 @@ def test_a_mean_over_sensors_gives_each_the_same_weight():
     assert np.isnan(ablate.pooled({'a': [1.0]})[1])
 
 
-@pytest.mark.parametrize(
-    'gains, expected',
-    [
+def test_verdicts_ask_for_more_than_chance():
+    for gains, expected in (
         ({'all': (3.0, 2.0), 'curved': (3.0, 2.0)}, 'earns: all'),
         ({'all': (0.4, 0.0), 'curved': (-5.0, 2.0)}, 'harms: curved'),
-        ({'all': (3.0, float('nan')), 'curved': (float('nan'), 1.0)}, ''),
+        ({'all': (3.0, np.nan), 'curved': (np.nan, 1.0)}, ''),
         ({'all': (-3.0, 2.0), 'border': (9.0, 1.0)}, 'earns: border; harms: all'),
-    ],
-)
-def test_verdicts_ask_for_more_than_chance(gains, expected):
-    assert ablate.verdict(gains) == expected
+    ):
+        assert ablate.verdict(gains) == expected, gains
 
 
 def test_borders_match_within_two_pixels():

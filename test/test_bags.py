@@ -183,9 +183,7 @@ def test_writer_leaves_nothing_half_written(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ['bag']
 
 
-def test_clouds_are_taken_where_there_are_no_images_and_one_topic_or_the_one_that_is_named(
-    tmp_path, run
-):
+def test_clouds_without_images_are_of_one_topic_or_of_the_one_that_is_named(tmp_path, run):
     recording = Recording()
     for metres, topic in ((1, '/a'), (2, '/b')):
         message = cloud((metres * CAMERA.rays).astype('<f4'))

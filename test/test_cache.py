@@ -84,9 +84,7 @@ def test_where_nothing_can_be_written_one_line_says_so(start):
 @pytest.mark.parametrize(
     ('variable', 'mode'), [(KEPT, 0o777), (KEPT, 0o1777), (KEPT, 0o755), (CACHE, 0o777)]
 )
-def test_folders_that_the_user_names_come_first_but_where_others_can_write(
-    tmp_path, variable, mode
-):
+def test_folders_named_by_the_user_come_first_but_where_others_can_write(tmp_path, variable, mode):
     """What is unpickled from there is executed."""
     named = tmp_path / 'named'
     within = named / 'rangeseg_ros' if variable == CACHE else named

@@ -159,7 +159,7 @@ def test_bad_input_of_replay_leaves_nothing(folder, refused):
         (['good', 'none'], 'none: No such file'),
         (['good', '--depth-topic', '/x'], 'no depth image on /x; topics: '),
         (['good', '--camera-topic', '/x'], 'no camera_info on /x; topics: '),
-        (['good', 'other/good'], '2 recordings named good would write the same results'),
+        (['good', 'other/good/good.mcap'], '2 recordings named good would write the same results'),
     ):
         assert message in refused('replay', *arguments, '--output', 'out')
         assert not (folder / 'out').exists()

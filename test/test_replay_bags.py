@@ -102,6 +102,7 @@ def test_a_finished_recording_is_not_done_again(tmp_path):
     first = replay(path, out)
     assert (first.frames, first.already_done) == (2, False)
     bag = (out / 'bag').stat().st_ino
+    (path / 'notes.txt').touch()  # not of the recording
     again = replay(path, out)
     assert (again.frames, again.notes, again.already_done) == (2, first.notes, True)
     assert (out / 'bag').stat().st_ino == bag

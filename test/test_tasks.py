@@ -1,6 +1,7 @@
 """Tasks in many processes, and signals: results, failures, workers and parents that die."""
 
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -35,10 +36,16 @@ class Square:
 
 
 @dataclass(frozen=True)
-class Raises:
-    error: Exception
+class Fails:
+    """Raises an error or, without one, kills its worker; once another has made a file."""
+
+    error: Exception | None = None
+    after: Path = Path()
 
     def run(self):
+        wait_for(self.after.exists)
+        if not self.error:
+            os.kill(os.getpid(), signal.SIGKILL)
         raise self.error
 
 
@@ -70,27 +77,16 @@ class LosesSignals:
             (self.folder / 'put away').touch()
 
 
-@dataclass(frozen=True)
-class FailsOnceBegun:
-    folder: Path
-    dies: bool = False
-
-    def run(self):
-        wait_for((self.folder / 'begun').exists)
-        if self.dies:
-            os.kill(os.getpid(), signal.SIGKILL)
-        raise KeyError('fault')
-
-
 def test_a_worker_that_loses_a_signal_is_told_again_but_not_while_it_puts_away(tmp_path):
     with pytest.raises(KeyError, match='fault'):
-        list(attempt_all([LosesSignals(tmp_path), FailsOnceBegun(tmp_path)], 2))
+        tasks = [LosesSignals(tmp_path), Fails(KeyError('fault'), tmp_path / 'begun')]
+        list(attempt_all(tasks, 2))
     assert (tmp_path / 'put away').exists()
 
 
 def test_a_worker_that_loses_a_signal_ends_where_another_dies(tmp_path):
     # A result first: the pool waits for a worker just started only from its next result on.
-    tasks = [LosesSignals(tmp_path), Square(2), FailsOnceBegun(tmp_path, dies=True)]
+    tasks = [LosesSignals(tmp_path), Square(2), Fails(after=tmp_path / 'begun')]
     assert [type(result) for result in attempt_all(tasks, 2)] == [type(None), int, Failure]
     assert (tmp_path / 'put away').exists()
 
@@ -107,7 +103,7 @@ def test_results_come_in_order_whatever_workers_die(tmp_path):
 
 @pytest.mark.parametrize('jobs', [1, 2])
 def test_a_failure_costs_its_task_and_no_other(jobs):
-    tasks = [Square(2), Raises(ValueError('bad')), Raises(MemoryError()), Square(3)]
+    tasks = [Square(2), Fails(ValueError('bad')), Fails(MemoryError()), Square(3)]
     results = list(attempt_all(tasks, jobs))
     assert results[0] == 4 and results[3] == 9
     assert [type(result.error) for result in results[1:3]] == [ValueError, MemoryError]
@@ -133,10 +129,11 @@ def test_workers_end_with_their_parent(tmp_path, name):
     try:
         threads = Path(f'/proc/{parent.pid}/task')
         workers = wait_for(lambda: len(found := children(threads)) >= 2 and found)
+        ends = [os.pidfd_open(int(worker)) for worker in workers]
         time.sleep(2)
         parent.send_signal(getattr(signal, name))
         parent.wait(20)
-        wait_for(lambda: not any(map(alive, workers)))
+        assert all(select.select([end], [], [], 120)[0] for end in ends)
     finally:
         parent.kill()
 
@@ -144,13 +141,6 @@ def test_workers_end_with_their_parent(tmp_path, name):
 def children(threads):
     """Processes that threads have started."""
     return [child for path in threads.glob('*/children') for child in path.read_text().split()]
-
-
-def alive(process):
-    try:
-        return Path(f'/proc/{process}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
-    except OSError:
-        return False
 
 
 def test_addresses_of_schedulers():
