@@ -8,9 +8,3 @@ def raster(image, magic=0x59A66A95, width=None, depth=8, kind=1, colours=0):
     height, columns = image.shape
     words = magic, columns if width is None else width, height, depth, image.size, kind, 0, colours
     return struct.pack('>8I', *words) + image.tobytes()
-
-
-def literal_lzf(data):
-    """LZF of incompressible data: runs of at most 32 literal bytes."""
-    runs = (data[i : i + 32] for i in range(0, len(data), 32))
-    return b''.join(bytes([len(run) - 1]) + run for run in runs)

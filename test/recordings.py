@@ -37,9 +37,8 @@ class Recording:
     """Messages to record: `add` them, then `write`."""
 
     def __init__(self, ros1=False):
+        self.ros1, self.messages = ros1, []
         self.store = ROS1 if ros1 else ROS2
-        self.ros1 = ros1
-        self.messages = []
 
     def header(self, stamp, frame_id='optical'):
         types = self.store.types

@@ -53,9 +53,7 @@ def test_a_mean_over_sensors_gives_each_the_same_weight():
     mean, error = ablate.pooled({'a': [1.0, 3.0], 'b': [4.0, np.nan], 'c': [np.nan]})
     assert (mean, error) == (3.0, 1.0)
     assert np.isnan(ablate.pooled({'a': [1.0]})[1])
-
-
-def test_verdicts_ask_for_more_than_chance():
+    # Verdicts ask for more than chance.
     for gains, expected in (
         ({'all': (3.0, 2.0), 'curved': (3.0, 2.0)}, 'earns: all'),
         ({'all': (0.4, 0.0), 'curved': (-5.0, 2.0)}, 'harms: curved'),

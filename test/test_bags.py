@@ -106,7 +106,7 @@ def test_camera_changes_on_the_way(tmp_path):
         assert [frame.camera.fx for frame in bag] == [50.0, 50.0, 60.0]
 
 
-def test_errors_list_the_topics_and_encodings(tmp_path):
+def test_errors_list_the_topics_and_encodings_or_say_that_it_is_no_bag(tmp_path):
     recording = Recording()
     recording.add_camera(1, topic='/left/camera_info')
     recording.add_camera(1, topic='/right/camera_info')
@@ -128,9 +128,6 @@ def test_errors_list_the_topics_and_encodings(tmp_path):
     ):
         with pytest.raises(BagError, match=message):
             DepthBag(tmp_path / name, *topics)
-
-
-def test_what_is_no_bag(tmp_path):
     with pytest.raises(BagError, match='No such file'):
         DepthBag(tmp_path / 'missing')
     for name in ('text.bag', 'text.mcap', 'text.db3', 'text.txt'):

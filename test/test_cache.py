@@ -61,7 +61,7 @@ def test_the_package_of_the_current_folder_is_not_compiled(tmp_path, monkeypatch
     (tmp_path / 'rangeseg_ros').mkdir()
     (tmp_path / 'rangeseg_ros/__init__.py').write_text("open('imported', 'w')")
     monkeypatch.chdir(tmp_path)
-    _compile(silent, Config(), ('image',), ())
+    _compile(print, Config(), ('image',), ())
     assert not (tmp_path / 'imported').exists()
 
 
@@ -179,10 +179,6 @@ def test_kernels_are_compiled_anew_when_what_they_call_has_changed(tmp_path):
     assert call() == ['2', '3', '0', '1']
 
 
-def silent(progress):
-    """No progress shown."""
-
-
 @functools.cache
 def found_by_a_process(*rehearsed):
     """Kernels that `rehearse(*rehearsed)` needs; discovery leaves its process interpreted."""
@@ -194,7 +190,7 @@ def found_by_a_process(*rehearsed):
 def test_frames_need_nothing_more(method):
     """Of any size, as clouds, and with less of the work, which changes while frames come."""
     config = Config(method=method)
-    prepare(config, report=silent)
+    prepare(config)
     budgets = [replace(config, work_budget=step) for step in STEPS[1:] if method == 'planes']
     for shape, configs in (((24, 32), [config]), ((121, 212), [config, *budgets])):
         camera = kinect_camera(*shape[::-1])

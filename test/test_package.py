@@ -104,16 +104,12 @@ def test_launchers_run_with_the_python_of_the_environment(tmp_path):
 def test_the_digest_follows_every_source_of_the_package(tmp_path):
     package, left_out = tmp_path / 'rangeseg_ros', shutil.ignore_patterns('*.nb*', '*.pyc')
     shutil.copytree(ROOT / 'rangeseg_ros', package, ignore=left_out)
-
-    def digest():
-        code = 'from rangeseg_ros.digest import code_digest; print(code_digest().hex())'
-        return python(code, cwd=tmp_path).stdout
-
-    seen = {digest()}
+    code = 'from rangeseg_ros.digest import code_digest; print(code_digest().hex())'
+    seen = {python(code, cwd=tmp_path).stdout}
     for name in ('core/config.py', 'io/tables.py', 'report/templates/replay.html'):
         with (package / name).open('a') as file:
             file.write('\n')
-        seen.add(digest())
+        seen.add(python(code, cwd=tmp_path).stdout)
     assert len(seen) == 4
 
 

@@ -127,8 +127,8 @@ def test_workers_end_with_their_parent(tmp_path, name):
     program.write_text(PARENT.format(folder=str(Path(__file__).parent)))
     parent = subprocess.Popen([sys.executable, program], stderr=subprocess.DEVNULL)
     try:
-        threads = Path(f'/proc/{parent.pid}/task')
-        workers = wait_for(lambda: len(found := children(threads)) >= 2 and found)
+        children = Path(f'/proc/{parent.pid}/task/{parent.pid}/children')
+        workers = wait_for(lambda: len(found := children.read_text().split()) >= 2 and found)
         ends = [os.pidfd_open(int(worker)) for worker in workers]
         time.sleep(2)
         parent.send_signal(getattr(signal, name))
@@ -136,11 +136,6 @@ def test_workers_end_with_their_parent(tmp_path, name):
         assert all(select.select([end], [], [], 120)[0] for end in ends)
     finally:
         parent.kill()
-
-
-def children(threads):
-    """Processes that threads have started."""
-    return [child for path in threads.glob('*/children') for child in path.read_text().split()]
 
 
 def test_addresses_of_schedulers():
