@@ -3,7 +3,6 @@
 import json
 import sys
 from functools import partial
-from pathlib import Path
 
 import matplotlib
 import numpy as np
@@ -43,10 +42,10 @@ def test_texts_are_short(seen, result):
 
 
 def test_the_command_says_once_that_up_is_off(seen, folder, run):
-    write_camera(Path('camera.yaml'), seen.camera)
+    write_camera(folder / 'camera.yaml', seen.camera)
     names = 'a.png', 'b.png'
     for name in names:
-        write_image(Path(name), seen.depth)
+        write_image(folder / name, seen.depth)
     segment = 'segment', '--camera', 'camera.yaml', '--output'
     one, two = run(*segment, 'one', names[0])[2], run(*segment, 'two', *names)[2]
     assert one.startswith('rangeseg: a.png: up as stated') and one.count('\n') == 1

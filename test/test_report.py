@@ -86,14 +86,11 @@ def sightings(*rows):
     return np.array([(*row, (0.0, 0.0, -1.0)) for row in rows], charts.SIGHTING)
 
 
-def test_planes_of_most_area_over_time_are_charted():
+def test_planes_of_most_area_over_time_are_charted_where_they_are_in_sight(monkeypatch):
     seen = sightings((0, 5, 1.0, 2.0), (0, 9, 4.0, 2.0), (1, 5, 1.0, 2.0), (1, 7, 3.0, 2.0))
     assert charts.longest_seen(seen, 2).tolist() == [9, 7]
     assert charts.longest_seen(seen, 9).tolist() == [9, 7, 5]
-
-
-def test_bars_and_lines_break_where_a_plane_is_out_of_sight(monkeypatch):
-    """Bars are as long as planes are in sight, drifts are told from medians."""
+    # Bars and lines break where a plane is out of sight; drifts are told from medians.
     monkeypatch.setattr(charts, 'svg', lambda figure: figure)
     times = np.arange(10) * 0.5
     seen = sightings(*((frame, number, 1.0, 2.0) for frame in (1, 2, 4) for number in (4, 9)))
