@@ -183,6 +183,8 @@ def test_files_of_others_are_kept_and_what_lacks_is_said(folders, tmp_path, refu
     assert 'plan.svg' in refused('plan', bag, '--output', folders / 'level')
     assert 'nowhere' in refused('plan', bag, '--output', out, '--fixed-frame', 'nowhere')
     assert not out.exists()
+    result = run('plan', bag, '--output', folders / 'level', '--overwrite')
+    assert result.exit_code == 0, result.output
 
 
 def turned(degrees):
