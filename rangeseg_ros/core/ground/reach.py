@@ -64,10 +64,14 @@ def _without_steps(
 
     A step is between cells side by side, whatever they are, so that the foot of a wall is none of
     the ground; one that is blurred over two cells leaves the cell between. A slope rises or falls
-    twice in three cells; where they lie on a line, all three are on it, else the middle one.
+    twice in three cells; where they lie on a line, all three are on it, else the middle one. The
+    shortest way that noise lets tell a cell of no slope decides: a longer one may lead from a wall
+    over the ground into a hole.
     """
     _, rows, columns = place.shape
     even = variance > 0
+    # Of each cell the shortest baseline over which it is known to be on no slope.
+    flat = np.full(even.shape, _BASELINES)
     for e in range(_BASELINES):
         down, right = (1 << e, 0) if axis == 0 else (0, 1 << e)
         for i in range(rows - down):
@@ -76,30 +80,28 @@ def _without_steps(
                 if not variance[i, c] * variance[k, m] > 0:
                     continue
                 up = place[0, k, m] - place[0, i, c]
-                square = variance[i, c] + variance[k, m]
-                if e > 0 and up * up < CLEARLY * CLEARLY * square:  # level, however far away
-                    continue
                 x, y = place[1, k, m] - place[1, i, c], place[2, k, m] - place[2, i, c]
                 way = np.sqrt(x * x + y * y)
+                over = abs(up) - slope * way
+                noise = OUTLIER * np.sqrt(variance[i, c] + variance[k, m])
                 # Beyond an edge the ground is hidden: what is next is farther than it is deep.
-                beside = e == 0 or way < step
-                if beside and abs(up) > slope * way + OUTLIER * np.sqrt(square) + step / 8:
+                if (e == 0 or way < step) and over > noise + step / 8:
                     even[i, c] = even[k, m] = False
                 p, q = k + down, m + right
-                if 2 * way < step or p >= rows or q >= columns or not variance[p, q] > 0:
+                if flat[k, m] < e or p >= rows or q >= columns or not variance[p, q] > 0:
                     continue
-                if e > 0 and abs(up) <= slope * way:
-                    continue
-                total = place[0, p, q] - place[0, i, c]
+                rest = place[0, p, q] - place[0, k, m]
                 x, y = place[1, p, q] - place[1, k, m], place[2, p, q] - place[2, k, m]
                 on = np.sqrt(x * x + y * y)
-                if e > 0 and (up * (total - up) <= 0 or abs(total - up) <= slope * on):
-                    continue
+                beyond = abs(rest) - slope * on
                 noise = CLEARLY * np.sqrt(variance[i, c] + variance[p, q])
-                if abs(total) > slope * (way + on) + noise:
+                if max(over, beyond) < -noise:
+                    flat[k, m] = e
+                elif up * rest > 0 and min(over, beyond) > 0 and over + beyond > noise:
                     even[k, m] = False
-                    if abs(up - total * way / (way + on)) < noise:
-                        even[i, c] = even[p, q] = False
+                    if abs(up * on - rest * way) < noise * (way + on):
+                        even[i, c] &= flat[i, c] < e
+                        even[p, q] &= flat[p, q] < e
     return even
 
 
