@@ -146,7 +146,7 @@ def estimate_up(planes: Sequence[MapPlane], looked: NDArray[np.float64], toleran
         return Up(looked, np.pi / 4, 'the images')
     cosine = np.abs(tried @ normals.T)
     fits = (cosine > np.cos(tolerance)) | (cosine < np.sin(tolerance))
-    up = tried[int((fits @ area * (tried @ looked)).argmax())]
+    up = guess = tried[int((fits @ area * (tried @ looked)).argmax())]
     weight = np.array([1 / max(np.trace(p.covariance[:3, :3]), 1e-8) for p in planes])
     for _ in range(_ROUNDS):
         along = np.abs(normals @ up)
@@ -155,9 +155,9 @@ def estimate_up(planes: Sequence[MapPlane], looked: NDArray[np.float64], toleran
         one = (normals.T * (weight * (1.0 * upright - level))) @ normals
         values, vectors = np.linalg.eigh(one + np.eye(3) * (weight @ level))
         up = vectors[:, 0] * np.sign(vectors[:, 0] @ up)
-    # One set of parallel walls leaves up free along them.
+    # One set of parallel walls leaves up free along them, and no level or upright plane anywhere.
     if values[1] < 1e-6 * values[2] or values[1] <= 0:
-        return Up(up, np.pi / 4, 'planes that do not tell it')
+        return Up(guess, np.pi / 4, 'planes that do not tell it')
     return Up(up, float(1 / np.sqrt(values[1])), 'level and upright planes')
 
 
