@@ -23,11 +23,6 @@ from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
 SLOW = pytest.mark.slow
 
 
-@pytest.fixture(scope='module')
-def seen():
-    return simulate(kinect_room(3), SENSORS['kinect'](1), seed=3)
-
-
 def enlarged(depth, camera, factor, crop, interpolation=cv2.INTER_NEAREST):
     """A depth image and its camera enlarged, without some pixels of each side."""
     size = depth.shape[1] * factor, depth.shape[0] * factor
