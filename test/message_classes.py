@@ -4,7 +4,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-from numpy.lib.recfunctions import unstructured_to_structured
 from rosbags.typesys import Stores, get_typestore
 
 from rangeseg_ros.messages.make import make_rclpy
@@ -37,27 +36,18 @@ def header(make=make_rosbags):
 def cloud(points, order='<', padding=0, names='xyz', **changes):
     """PointCloud2 of points (H, W, 3), each with a byte before and padding after it."""
     size = points.dtype.itemsize
-    offsets = [1, 1 + size, 1 + 2 * size]
-    dtype = np.dtype(
-        {
-            'names': list(names),
-            'formats': [points.dtype.newbyteorder(order)] * 3,
-            'offsets': offsets,
-            'itemsize': 1 + 3 * size + padding,
-        }
-    )
-    rows = unstructured_to_structured(points, dtype).view(np.uint8).reshape(len(points), -1)
+    step, kind = 1 + 3 * size + padding, {'datatype': {4: 7, 8: 8}[size], 'count': 1}
+    rows = np.ascontiguousarray(points, points.dtype.newbyteorder(order)).view(np.uint8)
+    rows = np.pad(rows, ((0, 0), (0, 0), (1, padding))).reshape(len(points), -1)
     rows = np.pad(rows, ((0, 0), (0, padding)))
-    kind = {'datatype': {4: 7, 8: 8}[size], 'count': 1}
-    columns = zip(names, offsets, strict=True)
     field = partial(make_rosbags, 'sensor_msgs/msg/PointField', **kind)
     fields = {
         'header': header(),
         'height': points.shape[0],
         'width': points.shape[1],
-        'fields': [field(name=name, offset=offset) for name, offset in columns],
+        'fields': [field(name=name, offset=1 + k * size) for k, name in enumerate(names)],
         'is_bigendian': order == '>',
-        'point_step': dtype.itemsize,
+        'point_step': step,
         'row_step': rows.shape[1],
         'data': rows.ravel(),
         'is_dense': False,

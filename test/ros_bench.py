@@ -70,13 +70,9 @@ def ended(process):
 
 
 @contextmanager
-def started(*arguments, outputs=('labels',), topics=(), **parameters):
+def started(outputs=('labels',), **parameters):
     """A node with a listener for outputs and a reliable camera."""
-    with (
-        Bench(*arguments, **parameters) as bench,
-        bench.listening(*outputs),
-        bench.camera_on(*topics),
-    ):
+    with Bench(**parameters) as bench, bench.listening(*outputs), bench.camera_on():
         yield bench
 
 
@@ -100,23 +96,17 @@ class Bench(AbstractContextManager):
     """Starts `segment_planes` and talks to it."""
 
     def __init__(
-        self,
-        *arguments,
-        camera=None,
-        namespace='',
-        name='segment_planes',
-        command=NODE,
-        **parameters,
+        self, *given, camera=None, namespace='', name='segment_planes', command=NODE, **parameters
     ):
         self.camera = camera or kinect_camera(160, 120)
         self.topics = [f'/{namespace}{topic}'.replace('//', '/') for topic in (DEPTH, INFO)]
-        set_to = [word for name in parameters for word in ('-p', f'{name}:={parameters[name]}')]
+        set_to = [word for key in parameters for word in ('-p', f'{key}:={parameters[key]}')]
         self.received = {name: [] for name in [*TYPES, 'diagnostics']}
         self.inputs = set()
         self.spins = False
         self.errors = tempfile.TemporaryFile('w+')  # noqa: SIM115
         self.process = subprocess.Popen(
-            [*command, '--ros-args', '-r', f'__ns:=/{namespace}', *arguments, *set_to],
+            [*command, '--ros-args', '-r', f'__ns:=/{namespace}', *given, *set_to],
             start_new_session=True,
             stderr=self.errors,
         )
@@ -126,19 +116,17 @@ class Bench(AbstractContextManager):
         self.executor = rclpy.executors.SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
         self.name = f'{namespace}/{name}'.lstrip('/')
-        kind, callback = DiagnosticArray, self._on_diagnostics
-        self.node.create_subscription(kind, '/diagnostics', callback, RELIABLE)
+        subscribe, callback = self.node.create_subscription, self._on_diagnostics
+        subscribe(DiagnosticArray, '/diagnostics', callback, RELIABLE)
         service = f'/{self.name}/set_parameters_atomically'
         self.client = self.node.create_client(SetParametersAtomically, service)
 
     @contextmanager
     def listening(self, *names):
         """Subscribe to outputs of the node; afterwards it has let go of its inputs."""
+        subscribe, own, received = self.node.create_subscription, f'/{self.name}/', self.received
         subscriptions = [
-            self.node.create_subscription(
-                TYPES[name], f'/{self.name}/{name}', self.received[name].append, RELIABLE
-            )
-            for name in names
+            subscribe(TYPES[name], own + name, received[name].append, RELIABLE) for name in names
         ]
         try:
             self.until(lambda: all(s.get_publisher_count() for s in subscriptions))
@@ -146,7 +134,7 @@ class Bench(AbstractContextManager):
         finally:
             for subscription in subscriptions:
                 self.node.destroy_subscription(subscription)
-        if not any(s.topic_name.startswith(f'/{self.name}/') for s in self.node.subscriptions):
+        if not any(s.topic_name.startswith(own) for s in self.node.subscriptions):
             for topic in self.inputs:
                 self.ignored(topic)
 
@@ -160,14 +148,14 @@ class Bench(AbstractContextManager):
             self.node.destroy_publisher(publisher)
 
     @contextmanager
-    def camera_on(self, image_topic=None, info_topic=None, kind=Image, qos=RELIABLE):
+    def camera_on(self, topic=None, kind=Image, qos=RELIABLE):
         """Advertise depth and camera_info, and wait for the subscriptions of the node."""
-        image_topic, info_topic = image_topic or self.topics[0], info_topic or self.topics[1]
+        depth_topic, info_topic = topic or self.topics[0], self.topics[1]
         with (
-            self.advertised(kind, image_topic, qos) as self.depth,
+            self.advertised(kind, depth_topic, qos) as self.depth,
             self.advertised(CameraInfo, info_topic, qos) as self.camera_info,
         ):
-            self.settled(image_topic, qos.reliability)
+            self.settled(depth_topic, qos.reliability)
             if kind is not PointCloud2:
                 self.settled(info_topic, qos.reliability)
             yield
@@ -191,14 +179,14 @@ class Bench(AbstractContextManager):
 
     def segment(self, image=None, info=None):
         """Publish an image with its camera_info; the labels (H, W) that come back."""
-        image = image or self.image()
-        self.send(image, info)
-        return self.labels_of(image)
+        return self.labels_of(self.send(image, info))
 
     def send(self, image=None, info=None):
-        """Publish an image with its camera_info."""
+        """Publish an image with its camera_info; the image."""
+        image = image or self.image()
         self.camera_info.publish(info or self.info())
-        self.depth.publish(image or self.image())
+        self.depth.publish(image)
+        return image
 
     def repeat(self, action, condition):
         """Do something five times a second until the condition holds; its value."""
@@ -225,17 +213,12 @@ class Bench(AbstractContextManager):
 
     def stream(self):
         """Publish images until one comes back, as best effort has no promise for the first."""
-
         sent = []
-
-        def publish():
-            sent.append(self.image())
-            self.send(sent[-1])
 
         def answered():
             return next((image for image in sent if self.find('labels', image)), None)
 
-        return self.labels_of(self.repeat(publish, answered))
+        return self.labels_of(self.repeat(lambda: sent.append(self.send()), answered))
 
     def spin(self, seconds):
         end = time.monotonic() + seconds

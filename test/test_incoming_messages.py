@@ -74,8 +74,7 @@ def test_numbers_of_fields_are_those_of_the_message():
     ],
 )
 def test_damaged_cloud_is_refused_with_the_reason(changes, problem):
-    names = changes.pop('names', 'xyz')
-    message = cloud(np.ones((3, 4, 3), np.float32), names=names, **changes)
+    message = cloud(np.ones((3, 4, 3), np.float32), **changes)
     with pytest.raises(MessageError, match=problem):
         points_from_message(message)
 

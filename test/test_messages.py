@@ -13,22 +13,14 @@ from scipy.spatial.transform import Rotation
 from rangeseg_ros import Camera, RangeImage, Segmentation, planes_from_message
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.ground.grid import GroundGrid
-from rangeseg_ros.core.ground.roles import ROLES
+from rangeseg_ros.core.ground.roles import ROLES, Ramp
 from rangeseg_ros.core.ground.stairs import Stairs
 from rangeseg_ros.drawing import colours
+from rangeseg_ros.messages import markers
 from rangeseg_ros.messages.cameras import camera_from_message, camera_info_message
 from rangeseg_ros.messages.clouds import planes_message, stairs_message
 from rangeseg_ros.messages.grids import grid_message, grid_points_message
 from rangeseg_ros.messages.images import depth_from_message, image_message
-from rangeseg_ros.messages.markers import (
-    ARROW_LENGTH,
-    LINE_STRIP,
-    Marker,
-    markers_bytes,
-    of_outline,
-    of_planes,
-    of_stairs,
-)
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
@@ -83,9 +75,7 @@ def test_planes_read_back_as_they_were():
 def test_node_and_replay_write_the_same_bytes(name, planes):
     make = needs_rclpy()
     camera = kinect_camera(32, 24)
-    labels = np.zeros(camera.shape, np.uint16)
-    for number in range(len(planes)):
-        labels[:, 4 * number :] = number + 1
+    labels = np.minimum(np.indices(camera.shape, np.uint16)[1] // 4, len(planes))
     image = RangeImage.from_depth(np.full(camera.shape, 2000, np.uint16), camera)
     result = Segmentation(labels, planes, {}, '')
     output = OUTPUTS[name]
@@ -103,17 +93,15 @@ TEXT = st.text(st.characters(exclude_characters='\0', codec='utf-8'), max_size=9
 def test_bytes_of_markers_are_those_of_the_message(drawn):
     """However long texts and lists of points are, by which everything after them is aligned."""
     scale, colour, position = (0.1, 0.2, 0.3), (0.25, 0.5, 0.75, 1.0), (1.0, 2.0, 3.0)
-    markers = []
-    for namespace, count, text in drawn:
+    given = []
+    for name, count, text in drawn:
         points = np.arange(3.0 * count).reshape(-1, 3)
-        marker = Marker(namespace, count - 3, LINE_STRIP, scale, colour, points, text, position)
-        markers.append(marker)
-    data = markers_bytes(header(), markers)
+        given.append(markers.Marker(name, count - 3, 4, scale, colour, points, text, position))
+    data = markers.markers_bytes(header(), given)
     message = STORE.deserialize_cdr(data, ARRAY)
     assert bytes(STORE.serialize_cdr(message, ARRAY)) == data
-    for read, marker in zip(message.markers[1:], markers, strict=True):
-        told = read.ns, read.id, read.type, read.text
-        assert told == (marker.namespace, marker.number, LINE_STRIP, marker.text)
+    for read, marker in zip(message.markers[1:], given, strict=True):
+        assert (read.ns, read.id, read.type, read.text) == (*marker[:2], 4, marker.text)
         np.testing.assert_array_equal(places(read.points), marker.points)
         assert (read.pose.position.z, read.scale.y, read.color.b) == (3.0, 0.2, 0.75)
         turn = read.pose.orientation
@@ -142,7 +130,7 @@ def test_cells_of_a_grid_are_where_its_axes_say(frame):
     assert points[:, 4].view('<u4').tolist() == [GROUND, OBSTACLE, DROP, GROUND]
 
 
-def test_stairs_and_the_outline_of_the_ground():
+def test_stairs_the_outline_of_the_ground_and_ramps():
     edge = np.array([[1.0, 2, 3], [3.0, 2, 5]])
     stairs = [Stairs(edge, 2.5, 4, 0.17, 0.28, way) for way in ('up', 'down')]
     message = stairs_message(make_rosbags, header(), stairs)
@@ -151,28 +139,31 @@ def test_stairs_and_the_outline_of_the_ground():
     expected = [2, 2, 4, *edge.ravel(), 2.5, 0.17, 0.28]
     np.testing.assert_allclose(points[:, :-2], [expected] * 2, rtol=1e-6)
     assert points[:, -2:].view('<i4').tolist() == [[4, 1], [4, -1]]
-    line, text, *_ = of_stairs(stairs)
-    assert (line.namespace, line.number, line.kind) == ('edges', 0, LINE_STRIP)
+    line, text, *_ = markers.of_stairs(stairs)
+    assert (line.namespace, line.number, line.kind) == ('edges', 0, markers.LINE_STRIP)
     np.testing.assert_array_equal(line.points, edge)
+    # Of lines, the width alone counts of their scale.
+    assert (line.scale[0], line.colour) == (0.04, (1.0, 0.6, 0.0, 1.0))
     assert (text.namespace, text.text) == ('stairs', 'up 4 x 0.17 / 0.28 m')
     assert text.position == (2, 2, 4)
-    (ring,) = of_outline([np.eye(3)])
+    (ring,) = markers.of_outline([np.eye(3)])
     np.testing.assert_array_equal(ring.points, np.eye(3)[[0, 1, 2, 0]])
+    assert (ring.scale[0], ring.colour) == (0.02, (0.1, 0.9, 0.1, 1.0))
+    arrow, _ = markers.of_ramps([Ramp(7, 9.0, np.ones(3), np.eye(3)[2])])
+    np.testing.assert_allclose(arrow.points, [(1, 1, 1), (1, 1, 1.4)])
+    assert (arrow.scale, arrow.colour) == ((0.03, 0.06, 0.1), line.colour)
 
 
 def markers_of(planes):
     """Markers of planes, those of a message."""
-    return STORE.deserialize_cdr(markers_bytes(header(), of_planes(planes)), ARRAY).markers
+    data = markers.markers_bytes(header(), markers.of_planes(planes))
+    return STORE.deserialize_cdr(data, ARRAY).markers
 
 
 def triangles_of(marker):
     """Corners (M, 3, 3) of a TRIANGLE_LIST, and its normals (M, 3), twice as long as the areas."""
     triangles = places(marker.points).reshape(-1, 3, 3)
     return triangles, np.cross(*np.diff(triangles, axis=1).swapaxes(0, 1))
-
-
-def area_of(normals):
-    return np.linalg.norm(normals, axis=1).sum() / 2
 
 
 def test_markers_start_anew_and_draw_hull_normal_and_id_of_every_plane():
@@ -184,9 +175,9 @@ def test_markers_start_anew_and_draw_hull_normal_and_id_of_every_plane():
     hull, normal, number, no_hull = drawn[:4]
     kinds = clear.TRIANGLE_LIST, clear.ARROW, clear.TEXT_VIEW_FACING
     assert (hull.type, normal.type, number.type) == kinds
-    assert area_of(triangles_of(hull)[1]) == pytest.approx(4.0)
+    assert np.linalg.norm(triangles_of(hull)[1], axis=1).sum() == pytest.approx(2 * 4.0)
     assert no_hull.points == []
-    ends = (0.25, 0.5, 2.0), (0.25, 0.5, 2.0 - ARROW_LENGTH)
+    ends = (0.25, 0.5, 2.0), (0.25, 0.5, 2.0 - markers.ARROW_LENGTH)
     np.testing.assert_allclose(places(normal.points), ends)
     assert number.text == '101 floor'
     assert {getattr(number.color, part) for part in 'rgba'} == {1.0}
@@ -194,34 +185,20 @@ def test_markers_start_anew_and_draw_hull_normal_and_id_of_every_plane():
     np.testing.assert_allclose(rgb, colours([101])[0])
 
 
-def test_concave_hull_with_a_hole_is_filled_and_no_more():
+@pytest.mark.parametrize('normal', [*np.eye(3), *-np.eye(3), (0.48, -0.6, 0.64)])
+def test_a_concave_hull_with_a_hole_is_filled_and_no_more_whatever_its_direction(normal):
     """A U of three by three metres with a notch of 1 x 2 and a hole of 0.5 x 0.5."""
-    outline = [(0, 0), (0, 3), (3, 3), (3, 0), (2, 0), (2, 2), (1, 2), (1, 0)]
+    axes = np.linalg.svd([normal])[2][1:]
+    axes[0] *= np.linalg.det([*axes, normal])
+    outline = [(0, 0), (1, 0), (1, 2), (2, 2), (2, 0), (3, 0), (3, 3), (0, 3)]
     hole = [(0.25, 1), (0.75, 1), (0.75, 1.5), (0.25, 1.5)]
-    rings = [[(x, y, 2.0) for x, y in ring] for ring in (outline, hole)]
-    triangles, normals = triangles_of(markers_of([stated_plane(1, rings[0], rings[1:])])[1])
-    assert area_of(normals) == pytest.approx(9 - 2 - 0.25)
-    np.testing.assert_allclose(triangles[..., 2], 2.0, atol=1e-12)
+    hull, ring = (ring @ axes - 2 * np.array(normal) for ring in (outline, hole))
+    found = replace(stated_plane(1, hull, [ring]), normal=np.array(normal))
+    triangles, normals = triangles_of(markers_of([found])[1])
+    np.testing.assert_allclose(triangles @ normal, -2.0, atol=1e-12)
     # Counter-clockwise seen from the sensor, so that normals point towards it.
-    assert (normals[:, 2] < 0).all()
-    x, y, _ = triangles.mean(axis=1).T
+    doubled = normals @ normal
+    assert (doubled > 0).all() and doubled.sum() / 2 == pytest.approx(9 - 2 - 0.25)
+    x, y = axes @ triangles.mean(axis=1).T
     assert not ((x > 1) & (x < 2) & (y < 2)).any()
     assert not ((abs(x - 0.5) < 0.25) & (abs(y - 1.25) < 0.25)).any()
-
-
-@pytest.mark.parametrize('axis', range(3))
-@pytest.mark.parametrize('sign', [-1, 1])
-def test_triangles_of_planes_of_any_direction_face_the_sensor(axis, sign):
-    tilt = Rotation.from_euler('xyz', [20, -15, 30], degrees=True)
-    normal = tilt.apply(sign * np.eye(3)[axis])
-    frame = np.linalg.svd(normal[None])[2][1:]
-    frame *= np.linalg.det([*frame, normal])
-    hull = np.array([(0, 0), (2, 0), (1, 0.5), (2, 2), (0, 2)]) @ frame - 2 * normal
-    found = replace(stated_plane(1, hull), normal=normal)
-    doubled = triangles_of(markers_of([found])[1])[1] @ normal
-    assert (doubled > 0).all() and doubled.sum() / 2 == pytest.approx(3)
-
-
-def test_a_hull_that_crosses_itself_still_makes_whole_triangles():
-    bow_tie = [(0, 0, 2), (1, 1, 2), (0, 1, 2), (1, 0, 2), (2, 3, 2)]
-    assert len(markers_of([stated_plane(1, bow_tie)])[1].points) % 3 == 0

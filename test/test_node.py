@@ -24,7 +24,7 @@ from rangeseg_ros.messages.make import make_rclpy
 
 pytestmark = pytest.mark.ros
 
-REPOSITORY = Path(__file__).parents[1]
+EXAMPLE = Path(__file__).parents[1] / 'examples' / 'print_planes.py'
 
 
 node, bench = benches('labels')
@@ -85,10 +85,9 @@ def test_other_inputs(node, expected, source):
 
 
 def test_the_example_reads_the_planes(bench, tmp_path):
-    example = REPOSITORY / 'examples' / 'print_planes.py'
     printed = tmp_path / 'printed'
     with printed.open('w') as errors:
-        run = subprocess.Popen([sys.executable, example], stderr=errors)
+        run = subprocess.Popen([sys.executable, EXAMPLE], stderr=errors)
     with ended(run):
         # The walls are a square root of 2 away.
         bench.until(lambda: bench.stream().any() and 'distance 1.41' in printed.read_text())
@@ -149,8 +148,7 @@ def test_frames_come_out_in_their_order(bench, expected):
     bench.in_use()
     bench.received['labels'].clear()
     for depth in (None, np.zeros_like(corner_depth(bench.camera))) * 10:
-        image = bench.image(depth)
-        bench.send(image)
+        image = bench.send(bench.image(depth))
         bench.spin(0.01)
     bench.answer('labels', image)
     stamps = [(m.header.stamp.sec, m.header.stamp.nanosec) for m in bench.received['labels']]

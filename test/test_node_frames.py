@@ -241,8 +241,7 @@ def test_the_map_is_latched_and_in_the_fixed_frame(robot):
 
 def test_without_its_transforms_a_frame_waits_and_is_segmented_all_the_same(robot):
     bench = robot.bench
-    image = bench.image(floor_depth(bench.camera))
-    bench.send(image)
+    image = bench.send(bench.image(floor_depth(bench.camera)))
     bench.spin(0.4)
     assert not bench.find('planes', image)
     # A later one whose transforms are there does not wait for it.
