@@ -5,7 +5,6 @@ import runpy
 import sys
 from operator import itemgetter
 from pathlib import Path
-from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import pytest
@@ -47,34 +46,30 @@ def launched(monkeypatch):
 
     There is no wheel of launch: what the file uses of it is replaced.
     """
-    launch, actions, substitutions, ros_actions = (MagicMock() for _ in range(4))
-    for name, module in {
-        'launch': launch,
-        'launch.actions': actions,
-        'launch.substitutions': substitutions,
-        'launch_ros': MagicMock(),
-        'launch_ros.actions': ros_actions,
-        'launch_ros.substitutions': MagicMock(),
-    }.items():
+    launch, launch_ros = MagicMock(), MagicMock()
+    for name, module in (('launch', launch), ('launch_ros', launch_ros)):
         monkeypatch.setitem(sys.modules, name, module)
-    substitutions.LaunchConfiguration = lambda name: SimpleNamespace(perform=itemgetter(name))
+        for part in ('actions', 'substitutions'):
+            monkeypatch.setitem(sys.modules, f'{name}.{part}', getattr(module, part))
+    launch.substitutions.LaunchConfiguration = lambda name: MagicMock(perform=itemgetter(name))
+    # Here no folder is installed, and no profile set.
+    launch.substitutions.PathJoinSubstitution = lambda parts: str(ROOT.joinpath(*parts[1:]))
+    launch.substitutions.EnvironmentVariable = lambda name, default_value: default_value
     runpy.run_path(os.fspath(LAUNCH_FILE))['generate_launch_description']()
-    declared = {c.args[0]: c.kwargs for c in actions.DeclareLaunchArgument.call_args_list}
+    arguments = launch.actions.DeclareLaunchArgument.call_args_list
+    declared = {argument.args[0]: argument.kwargs for argument in arguments}
     ((described,), _) = launch.LaunchDescription.call_args
     assert len(described) == len(declared) + 1  # the function that makes the nodes
 
     def launched_with(**given):
-        values = {name: argument['default_value'] for name, argument in declared.items()}
-        assert set(given) <= set(values)
-        values['params_file'] = os.fspath(ROOT / 'params/segment_planes.yaml')
-        values['fastdds_profile'] = os.fspath(ROOT / 'params/fastdds_large_images.xml')
-        values |= given
+        assert set(given) <= set(declared)
+        values = {name: argument['default_value'] for name, argument in declared.items()} | given
         for name, argument in declared.items():
             choices = argument['choices']
             assert argument['description'] and (choices is None or values[name] in choices)
-        ros_actions.Node.reset_mock()
-        actions.OpaqueFunction.call_args.kwargs['function'](values)
-        return [call.kwargs for call in ros_actions.Node.call_args_list]
+        launch_ros.actions.Node.reset_mock()
+        launch.actions.OpaqueFunction.call_args.kwargs['function'](values)
+        return [call.kwargs for call in launch_ros.actions.Node.call_args_list]
 
     return launched_with
 
@@ -124,8 +119,9 @@ def test_the_node_starts_with_what_the_launch_file_gives_it(launched, tmp_path, 
             file.write_text(yaml.safe_dump({'/**': {'ros__parameters': parameters}}))
             parameters = os.fspath(file)
         arguments += ['--params-file', parameters]
-    for name, value in node['additional_env'].items():
-        monkeypatch.setenv(name, value)
+    ((variable, profile),) = node['additional_env'].items()
+    assert Path(profile).exists()
+    monkeypatch.setenv(variable, profile)
     with Bench(*arguments, namespace=node['namespace'], name=node['name']) as bench:
         bench.until(lambda: 'will subscribe' in bench.log())
     log = bench.log()
