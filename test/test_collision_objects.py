@@ -25,7 +25,7 @@ from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 pytestmark = pytest.mark.ros
 
-REPOSITORY = Path(__file__).parents[1]
+EXAMPLE = Path(__file__).parents[1] / 'examples' / 'collision_objects.py'
 
 
 class CollisionObject(SimpleNamespace):
@@ -34,34 +34,22 @@ class CollisionObject(SimpleNamespace):
     ADD, REMOVE = b'\x00', b'\x01'
 
 
-@pytest.fixture
-def example(monkeypatch):
-    """Names of the example."""
-    messages = SimpleNamespace(CollisionObject=CollisionObject)
-    monkeypatch.setitem(sys.modules, 'moveit_msgs', SimpleNamespace(msg=messages))
-    monkeypatch.setitem(sys.modules, 'moveit_msgs.msg', messages)
-    return runpy.run_path(str(REPOSITORY / 'examples' / 'collision_objects.py'))
-
-
-class Scene(list):
-    """Takes the place of the node and of its publisher."""
-
-    def __init__(self):
-        self.known, self.scene, self.publish = {}, self, self.append
-
-
 def area(mesh):
     """Area of a shape_msgs/Mesh, square metres."""
     corners = np.array([(p.x, p.y, p.z) for p in mesh.vertices])
     triangles = np.array([triangle.vertex_indices for triangle in mesh.triangles])
     # Every corner is used, and none is made up.
     assert set(triangles.ravel()) == set(range(len(corners)))
-    first, second, third = np.moveaxis(corners[triangles], 1, 0)
-    return np.linalg.norm(np.cross(second - first, third - first), axis=1).sum() / 2
+    sides = np.diff(corners[triangles], axis=1)
+    return np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum() / 2
 
 
-def test_hulls_become_meshes_and_go_with_their_planes(example):
+def test_hulls_become_meshes_and_go_with_their_planes(monkeypatch):
     """Of a floor 0.8 m below the camera and a wall 3 m ahead."""
+    messages = SimpleNamespace(CollisionObject=CollisionObject)
+    monkeypatch.setitem(sys.modules, 'moveit_msgs', SimpleNamespace(msg=messages))
+    monkeypatch.setitem(sys.modules, 'moveit_msgs.msg', messages)
+    example = runpy.run_path(str(EXAMPLE))
     camera = kinect_camera(160, 120)
     depth = np.minimum(0.8 / np.maximum(camera.rays[..., 1], 1e-6), 3).astype(np.float32)
     image = RangeImage.from_depth(depth, camera)
@@ -72,8 +60,9 @@ def test_hulls_become_meshes_and_go_with_their_planes(example):
     )
     assert example['floor_of'](planes).coef == pytest.approx([0, -1, 0, 0.8], abs=1e-3)
     markers = deserialize_message(markers, MarkerArray)
-    planes, scene = result.planes, Scene()
-    example['CollisionObjects'].on_markers(scene, markers)
+    planes, scene = result.planes, []
+    node = SimpleNamespace(known={}, scene=SimpleNamespace(publish=scene.append))
+    example['CollisionObjects'].on_markers(node, markers)
     assert [(o.id, o.operation) for o in scene] == [(f'plane {p.id}', b'\x00') for p in planes]
     assert len(planes) == 2
     for item, plane in zip(scene, planes, strict=True):
@@ -83,7 +72,7 @@ def test_hulls_become_meshes_and_go_with_their_planes(example):
     scene.clear()
     assert [marker.ns for marker in markers.markers].count('hulls') == 2
     wall = MarkerArray(markers=[m for m in markers.markers if m.id != planes[0].id])
-    example['CollisionObjects'].on_markers(scene, wall)
+    example['CollisionObjects'].on_markers(node, wall)
     # What has not changed is not sent again.
     assert [(o.id, o.operation) for o in scene] == [(f'plane {planes[0].id}', b'\x01')]
     scene.clear()
@@ -93,5 +82,5 @@ def test_hulls_become_meshes_and_go_with_their_planes(example):
             # Triangles share their corners.
             for point in {id(point): point for point in marker.points}.values():
                 point.z += shift
-        example['CollisionObjects'].on_markers(scene, moved)
+        example['CollisionObjects'].on_markers(node, moved)
     assert [(o.id, o.operation) for o in scene] == [(f'plane {planes[1].id}', b'\x00')]
