@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, contextmanager
 import numpy as np
 import pytest
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from message_classes import cdr
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
@@ -210,6 +210,11 @@ class Bench(AbstractContextManager):
             return next(filter(condition, statuses), None)
 
         return self.repeat(publish, found)
+
+    def error(self, words, publish=lambda: None):
+        """The first error of the diagnostics from now on that says so."""
+        error = DiagnosticStatus.ERROR
+        return self.status(lambda s: s.level == error and words in s.message, publish)
 
     def stream(self):
         """Publish images until one comes back, as best effort has no promise for the first."""

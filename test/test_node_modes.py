@@ -51,13 +51,10 @@ import os
 import rclpy
 from rangeseg_ros.ros.node import SegmentPlanes
 rclpy.init()
-nodes = [SegmentPlanes(namespace=name) for name in ('front', 'rear')]
-executor = rclpy.executors.SingleThreadedExecutor()
-for node in nodes:
-    executor.add_node(node)
-executor.spin_once(1.0)
-topics = [publisher.topic_name for node in nodes for publisher in node.publishers]
-print(*(topic for topic in topics if topic.endswith('/labels')), flush=True)
+for node in [SegmentPlanes(namespace=name) for name in ('front', 'rear')]:
+    rclpy.spin_once(node, timeout_sec=1.0)
+    topics = [publisher.topic_name for publisher in node.publishers]
+    print(*(topic for topic in topics if topic.endswith('/labels')), flush=True)
 os._exit(0)  # while kernels are being compiled
 """
     done = python(code)
@@ -70,10 +67,8 @@ node, bench = benches('labels', 'status', camera=kinect_camera(161, 121))
 
 def test_every_frame_is_made_again_with_what_it_records(bench):
     depth = simulate(kinect_room(2), Kinect(0), bench.camera, seed=2).depth
-    offline = {}
-    for step in STEPS:
-        image = RangeImage.from_depth(depth, bench.camera)
-        offline[step] = Segmenter(Config(work_budget=step)).segment(image).labels
+    image = RangeImage.from_depth(depth, bench.camera)
+    offline = {step: Segmenter(Config(work_budget=step)).segment(image).labels for step in STEPS}
     assert all((offline[1.0] != offline[step]).any() for step in STEPS[1:])
 
     def next_budget():

@@ -38,10 +38,8 @@ PARAMS = Path(__file__).parents[1] / 'params' / 'segment_planes.yaml'
 
 @pytest.fixture(scope='module')
 def context():
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    yield context
-    rclpy.shutdown(context=context)
+    with rclpy.Context() as context:
+        yield context
 
 
 @pytest.fixture

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from processes import RANGESEG
-from recordings import Recording
+from recordings import Recording, depth_images, record
 
 pytest.importorskip('rclpy')
 
-from ros_bench import DEPTH, INFO, Bench, corner_depth, ended, values_of
+from ros_bench import DEPTH, INFO, Bench, ended, values_of
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 
@@ -24,17 +24,11 @@ pytestmark = pytest.mark.ros
 PROFILE = Path(__file__).parents[1] / 'params' / 'fastdds_large_images.xml'
 
 
-def record(path, camera, count, period):
-    """Write a bag of two walls that come nearer from image to image."""
-    with DepthBagWriter(path, camera) as bag:
-        for index in range(count):
-            depth = corner_depth(camera) - np.uint16(10 * index)
-            bag.write(depth, 10**9 + round(index * period * 1e9))
-
-
 def test_rate_loop_and_clock(tmp_path):
     """Ten images a second apart, twenty times as fast, again and again; /clock between them."""
-    record(tmp_path / 'bag', kinect_camera(16, 12), 10, 1.0)
+    with DepthBagWriter(tmp_path / 'bag', kinect_camera(16, 12)) as bag:
+        for second in range(1, 11):
+            bag.write(np.ones((12, 16), np.uint16), second * 10**9)
     images, infos, times = [], [], []
     with Bench() as bench:
         bench.node.create_subscription(Image, DEPTH, images.append, 1000)
@@ -93,8 +87,7 @@ def test_topics_that_ros_refuses_are_left_out(tmp_path, run):
 
 
 def test_a_recording_without_its_end_is_said_to_have_none(tmp_path, run):
-    record(tmp_path / 'bag', kinect_camera(640, 480), 10, 0.01)
-    (file,) = (tmp_path / 'bag').glob('*.mcap')
+    file = record(tmp_path / 'bag', 'mcap', depth_images(10, 480, 640))
     os.truncate(file, file.stat().st_size * 6 // 10)
     code, _, error = run('play', tmp_path / 'bag')
     assert code == 2 and error.count('\n') == 1 and 'bag: without its end' in error
