@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from rangeseg_ros.messages.make import make_rclpy
+from rangeseg_ros.messages.make import header_of, make_rclpy
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
@@ -29,8 +29,7 @@ def cdr(message, kind):
 
 
 def header(make=make_rosbags):
-    stamp = make('builtin_interfaces/msg/Time', sec=12, nanosec=345)
-    return make('std_msgs/msg/Header', stamp=stamp, frame_id='optical')
+    return header_of(make, 12_000_000_345, 'optical')
 
 
 def cloud(points, order='<', padding=0, names='xyz', **changes):

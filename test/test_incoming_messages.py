@@ -79,27 +79,14 @@ def test_damaged_cloud_is_refused_with_the_reason(changes, problem):
         points_from_message(message)
 
 
-LARGE = st.integers(0, 2**32 - 1)
+LARGE, BYTE = st.integers(0, 2**32 - 1), st.integers(0, 255)
+SIZES = dict.fromkeys(('height', 'width', 'point_step', 'row_step'), LARGE)
+DATA = st.binary(max_size=200).map(lambda data: np.frombuffer(data, np.uint8))
+NAME = st.sampled_from(['x', 'y', 'z', '', 'w'])
+FIELD = st.fixed_dictionaries({'name': NAME, 'offset': LARGE, 'count': LARGE, 'datatype': BYTE})
 
 
-@given(
-    st.fixed_dictionaries(
-        {
-            **dict.fromkeys(('height', 'width', 'point_step', 'row_step'), LARGE),
-            'data': st.binary(max_size=200).map(lambda data: np.frombuffer(data, np.uint8)),
-        }
-    ),
-    st.lists(
-        st.fixed_dictionaries(
-            {
-                'name': st.sampled_from(['x', 'y', 'z', '', 'w']),
-                **dict.fromkeys(('offset', 'count'), LARGE),
-                'datatype': st.integers(0, 255),
-            }
-        ),
-        max_size=5,
-    ),
-)
+@given(st.fixed_dictionaries({**SIZES, 'data': DATA}), st.lists(FIELD, max_size=5))
 def test_any_bytes_are_a_cloud_or_a_named_error(changes, layout):
     changes['fields'] = [make_rosbags('sensor_msgs/msg/PointField', **field) for field in layout]
     for read in (points_from_message, planes_from_message):

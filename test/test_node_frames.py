@@ -37,8 +37,7 @@ FRAMES = {'gravity_frame': 'base_footprint', 'target_frame': 'base_link', 'fixed
 def floor_depth(camera, pitch=PITCH):
     """Depth of the ground, millimetres; 0 above the horizon."""
     down = camera.rays @ np.array([0, np.cos(pitch), np.sin(pitch)])
-    with np.errstate(divide='ignore'):
-        depth = np.where(down > 0.1, HEIGHT / down, 0)
+    depth = np.where(down > 0.1, HEIGHT / np.maximum(down, 0.1), 0)
     return np.round(1000 * depth).astype(np.uint16)
 
 
