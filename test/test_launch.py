@@ -94,15 +94,9 @@ def test_the_node_starts_with_what_the_launch_file_gives_it(launched, tmp_path, 
 
     extra = tmp_path / 'extra.yaml'
     extra.write_text('/**:\n  ros__parameters:\n    min_pixels: 77\n')
-    (node,) = launched(
-        namespace='robot',
-        name='planes',
-        depth='camera/depth/image_rect',
-        imu='camera/imu',
-        use_imu='true',
-        extra_params_file=os.fspath(extra),
-        log_level='debug',
-    )
+    topics = {'depth': 'camera/depth/image_rect', 'imu': 'camera/imu', 'use_imu': 'true'}
+    names = {'namespace': 'robot', 'name': 'planes', 'extra_params_file': os.fspath(extra)}
+    (node,) = launched(**topics, **names, log_level='debug')
     # As launch_ros puts it together.
     arguments = [*node['ros_arguments'], '-r', f'__node:={node["name"]}']
     for source, target in node['remappings']:

@@ -226,12 +226,10 @@ def test_the_interval_is_kept(monkeypatch):
 def test_what_may_help_against_losses_follows_the_size_of_the_messages(monkeypatch):
     source = DepthInput.__new__(DepthInput)
     monkeypatch.delenv(PROFILE_VARIABLE, raising=False)
-    told = {}
-    for size in (0, SEGMENT_SIZE, SEGMENT_SIZE + 1):
+    hints = 'if they are over', '', 'messages over'
+    for size, hint in zip((0, SEGMENT_SIZE, SEGMENT_SIZE + 1), hints, strict=True):
         source._largest = size
-        told[size] = source.loss_hint()
-    assert told[0].startswith('if they are over') and told[SEGMENT_SIZE] == ''
-    assert told[SEGMENT_SIZE + 1].startswith('messages over')
+        assert source.loss_hint().partition(' 512 KiB')[0] == hint
     monkeypatch.setenv(PROFILE_VARIABLE, 'profile.xml')
     assert 'publisher needs it' in source.loss_hint()
 
@@ -275,9 +273,8 @@ def test_what_is_found_is_told_and_what_is_wrong(found, level, message):
 def test_the_latency_is_unknown_where_stamps_are_not_of_the_clock_of_the_node(transport):
     """They are more than `stall_timeout` apart from it, which is an hour."""
     times = FrameTimes(transport, 2.0, 3.0, 4.0, 5.0, {'refining': 3.5})
-    values = {
-        name: value for name, value in values_of(status(times=times)).items() if 'ms' in name
-    }
+    told = values_of(status(times=times))
+    values = {name: value for name, value in told.items() if 'ms' in name}
     parts = {'waiting': 2, 'conversion': 3, 'compute': 4, 'compute: refining': 3.5}
     expected = {'latency since arrival': 14, **parts, 'publication': 5}
     if abs(transport) <= 3.6e6:
