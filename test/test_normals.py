@@ -5,6 +5,7 @@ import pytest
 
 from rangeseg_ros import Camera, Config, RangeImage
 from rangeseg_ros.core.by_normals.directions import directions
+from rangeseg_ros.core.by_normals.labelling import minimise
 from rangeseg_ros.core.by_normals.normals import cross_product, observed_normals, plane_fit
 from rangeseg_ros.core.sensing.grid import Grid
 
@@ -98,3 +99,9 @@ def test_directions_leave_no_large_gap():
     random = random[random[:, 2] < -0.2]
     nearest = np.degrees(np.arccos((random @ directions(305).T).max(axis=1)))
     assert nearest.max() < 9
+
+
+def test_labels_of_a_single_row_grow_over_its_only_edge():
+    known, labels = directions(73).astype(np.float32), np.repeat([5, 9], 20)[None]
+    grid = Grid(np.ones((1, 39), bool), np.ones((0, 40), bool))
+    np.testing.assert_array_equal(minimise(known[labels], known, grid, 40.0), labels)

@@ -190,6 +190,8 @@ def test_the_command_prints_what_ros_takes_and_says_when_there_is_no_floor(tmp_p
     values, sigma = np.array(told, float).T
     error = np.abs(values - (3, 25, 1.1))
     assert (error < (1, 1, 0.02)).all() and (error < 4 * sigma).all()
+    # The camera errs by no pose in its own frame.
+    assert (sigma < (0.2, 0.2, 0.008)).all()
     assert '--frame-id base_footprint --child-frame-id camera_depth_optical_frame' in output
     assert '<origin xyz="0 0 1.' in output
     assert wall[0] == 2 and 'no plane that faces up' in wall[2]

@@ -95,6 +95,8 @@ def test_small_planes_are_no_floor_wall_or_ceiling():
     )
     assert max(plane.area for plane in found) < 0.1 and roles(found, LEVEL) == ['other'] * 3
     assert roles(found, Config(role_area=0.001)) == ['floor', 'wall', 'ceiling']
+    # What hangs from a ceiling is none.
+    assert roles(planes((TOP, DOWN, 1), ((slice(0, 8), ALL), AHEAD, 2.5)), LEVEL)[1] == 'wall'
 
 
 def test_parts_of_one_surface_are_large_together():

@@ -24,12 +24,16 @@ CAMERA = resize(Kinect().camera, 320, 240)
 FLOOR = slab(-3, 12, 0, 0, ALL)
 
 
-def treads(edge, count, rise, run, class_, sides):
-    sign = 1 if class_ == OBSTACLE else -1
-    for k in range(count):
-        end = edge + (k + 1) * run if k < count - 1 else edge + count * run + 3
-        level = sign * (k + 1) * rise
-        yield Piece(slab(edge + k * run, end, level, level, sides), class_, abs(level))
+def treads(edge, rise, run, class_, sides):
+    """One tread for each of `sides`, and a landing as wide as the last one."""
+    for k, y in enumerate(sides, 1):
+        level, begin = k * rise if class_ == OBSTACLE else -k * rise, edge + (k - 1) * run
+        end = begin + run + 3 * (k == len(sides))
+        yield Piece(slab(begin, end, level, level, y), class_, abs(level))
+
+
+def up_stairs(sides):
+    return treads(1.9, 0.17, 0.28, OBSTACLE, sides)
 
 
 def seen(*pieces, height=1.5, pitch=35, yaw=0):
@@ -52,7 +56,7 @@ def up_of(up):
 def test_edge_count_rise_and_run(direction, begin, count, rise, run, tmp_path):
     sides, class_ = (-0.5, 0.6), OBSTACLE if direction == 'up' else DROP
     floor = FLOOR if direction == 'up' else slab(-3, begin, 0, 0, ALL)
-    pieces = Piece(floor, GROUND), *treads(begin, count, rise, run, class_, sides)
+    pieces = Piece(floor, GROUND), *treads(begin, rise, run, class_, count * [sides])
     terrain, image, result = seen(*pieces, yaw=10)
     (stairs,) = result.stairs
     assert (stairs.direction, stairs.count) == (direction, count)
@@ -71,8 +75,7 @@ def test_edge_count_rise_and_run(direction, begin, count, rise, run, tmp_path):
 
 
 def test_the_edge_is_in_the_frame_of_a_cloud():
-    floor = Piece(FLOOR, GROUND)
-    terrain, image, result = seen(floor, *treads(1.9, 3, 0.17, 0.28, OBSTACLE, (-0.5, 0.6)))
+    terrain, image, result = seen(Piece(FLOOR, GROUND), *up_stairs(3 * [(-0.5, 0.6)]))
     turn, place = Rotation.from_rotvec((1.3, -0.7, 2.1)).as_matrix(), np.array([0.3, 0.2, 0.8])
     cloud = RangeImage.from_points((image.points @ turn.T + place).astype(np.float32))
     config = Config(**up_of(turn @ terrain.up), sensor_height=1.5)
@@ -89,13 +92,25 @@ def test_boxes_side_by_side_and_one_step_are_no_stairs():
     ]
     curb = Piece(slab(1.9, 12, 0.17, 0.17, ALL), OBSTACLE, 0.17)
     for pieces in (boxes, [curb]):
-        assert seen(*pieces, Piece(FLOOR, GROUND))[2].stairs == []
+        result = seen(*pieces, Piece(FLOOR, GROUND))[2]
+        # Nothing is worked out unless it is asked for.
+        assert not {'ground', 'stairs'} & set(vars(result))
+        assert result.stairs == [] and 'ground' in vars(result)
 
 
-def test_nothing_is_worked_out_unless_asked_for():
-    result = seen(Piece(FLOOR, GROUND))[2]
-    assert not {'ground', 'stairs'} & set(vars(result))
-    assert result.stairs == [] and 'ground' in vars(result)
+@pytest.mark.parametrize(
+    ('sides', 'count'),
+    [
+        # Noses as wide as treads share, of which each next pair has half in common, or less.
+        ([(-0.8 + 0.3 * k, 0.2 + 0.3 * k) for k in range(3)], 3),
+        ([(-0.2 - 0.35 * k, 0.8 - 0.35 * k) for k in range(3)], None),
+        # No column sees the third tread and the fourth.
+        ([(-0.6, 0.6), (-0.6, 0.6), (0, 0.6), (-0.6, 0), (-0.6, 0)], 3),
+    ],
+)
+def test_treads_follow_each_other(sides, count):
+    found = seen(*up_stairs(sides), Piece(FLOOR, GROUND))[2].stairs
+    assert [stairs.count for stairs in found] == [count] * (count is not None)
 
 
 @pytest.mark.parametrize('axis', [(1, 0, 0), (-1, 0, 0), (0, 0, 1)])

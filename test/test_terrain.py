@@ -15,7 +15,7 @@ from rangeseg_ros.core.ground.reach import reach
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import SequenceSegmenter, with_roles
 from rangeseg_ros.simulation.sensors.kinect import Kinect
-from rangeseg_ros.simulation.sensors.sensor import resize
+from rangeseg_ros.simulation.sensors.sensor import Ideal, resize
 from rangeseg_ros.simulation.solids import box
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
 from rangeseg_ros.simulation.terrain.kinds import stated, terrain_scene
@@ -183,6 +183,14 @@ def test_a_pit_is_unseen_in_a_cloud_as_well_and_outlined():
     assert count[1] > 0.8 * count[0] > 400
     edge = in_the_world(np.concatenate(outlines(image, result.ground)), terrain)
     assert (np.abs(edge[:, 0] - 1.5) < 0.06).sum() > 1
+
+
+def test_stones_are_nearer_or_farther_than_the_ground_by_three_tenths_at_most():
+    flat = scene(Piece(FLOOR, GROUND), height=0.4)
+    scenes = replace(flat, relief=9.0), flat
+    rough, smooth = (simulate_terrain(each, Ideal(0), CAMERA).depth for each in scenes)
+    off = (rough / smooth)[smooth > 0] - 1
+    assert [off.min(), off.max()] == pytest.approx([-0.3, 0.3], abs=1e-6)
 
 
 def image_of(terrain):
