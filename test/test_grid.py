@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from terrain_scenes import drop_of, scene
 
 from rangeseg_ros import Config, RangeImage
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN
@@ -16,32 +17,30 @@ from rangeseg_ros.simulation.sensors.kinect import Kinect
 from rangeseg_ros.simulation.sensors.sensor import resize
 from rangeseg_ros.simulation.solids import box
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
-from rangeseg_ros.simulation.terrain.scene import ALL, FAR, Piece, Terrain, slab
+from rangeseg_ros.simulation.terrain.scene import Piece
 
 CAMERA = resize(Kinect().camera, 320, 240)
 HEIGHT, EDGE = 0.8, 2.0
 GROUND_IN_MAP = 0.3
-FLOOR = Piece(slab(-3, EDGE, 0, 0, ALL), GROUND)
-LANDING = Piece(slab(EDGE, FAR, -0.15, -0.15, ALL), DROP, 0.15)
+FLOOR, LANDING = drop_of(0.15, EDGE)
 BOX = Piece(box((0.2, 0.2, 0.3), np.eye(3), (1.4, 0.3, 0.15)), OBSTACLE, 0.3)
 
 
 class Drive:
     """A camera on a robot that is at x, looking ahead; world: z up."""
 
-    def __init__(self, pitch=30, posed=True, **parameters):
-        self.pose = Pose.looking((0, 0, HEIGHT), 0, pitch, 0)
+    def __init__(self, posed=True, **parameters):
+        self.pose = Pose.looking((0, 0, HEIGHT), 0, 30, 0)
         up = dict(zip(('up_x', 'up_y', 'up_z'), map(float, self.pose.rotation[2]), strict=True))
-        fixed = {'fixed_frame': 'map'} if posed else {}
-        self.sequence = SequenceSegmenter(
-            Config(**up, **fixed, sensor_height=HEIGHT, **parameters)
-        )
+        fixed = 'map' if posed else ''
+        config = Config(**up, fixed_frame=fixed, sensor_height=HEIGHT, **parameters)
+        self.sequence = SequenceSegmenter(config)
 
     def grid(self, x, second, pieces=(FLOOR, LANDING, BOX)):
         pose = replace(self.pose, position=np.array([x, 0, HEIGHT]))
-        scene = Terrain('', tuple(pieces), (slab(-3, FAR, 0, 0, ALL),), pose)
-        frame = simulate_terrain(scene, Kinect(), CAMERA, seed=int(second))
-        told = Transform(pose.rotation, pose.position + np.array([0, 0, GROUND_IN_MAP]))
+        terrain = replace(scene(*pieces), pose=pose)
+        frame = simulate_terrain(terrain, Kinect(), CAMERA, seed=int(second))
+        told = Transform(pose.rotation, np.add(pose.position, (0, 0, GROUND_IN_MAP)))
         at = told if self.sequence.config.map_frame else None
         image = RangeImage.from_depth(frame.depth, CAMERA)
         return self.sequence.segment(image, int(1e9 * second), pose=at).grid
@@ -85,11 +84,12 @@ def test_ground_that_is_seen_again_takes_danger_back_and_age_forgets():
     assert at(hidden, 1.8, -0.3) == UNKNOWN and np.isinf(at(hidden, 1.8, -0.3, hidden.age))
 
 
-def test_without_poses_the_grid_is_of_one_image_and_in_its_frame():
-    drive = Drive(posed=False)
-    drive.grid(0, 0)
-    grid = drive.grid(0, 1, (FLOOR, LANDING))
-    assert grid.frame == ''
+@pytest.mark.parametrize(('posed', 'second'), [(False, 2), (True, 0)])
+def test_without_poses_or_where_time_goes_back_the_grid_is_of_one_image(posed, second):
+    drive = Drive(posed)
+    assert OBSTACLE in drive.grid(0, 1).classes
+    grid = drive.grid(0, second, (FLOOR, LANDING))
+    assert grid.frame == ('map' if posed else '')
     assert OBSTACLE not in grid.classes and (grid.classes == GROUND).sum() > 300
 
 
@@ -112,12 +112,6 @@ def test_heights_of_a_cell_are_filtered_until_they_contradict(second, height, va
         memory._count(GROUND, points, np.full(2, square), 0.0)
     assert memory._layers[1, 0, 0] == pytest.approx(height)
     assert memory._layers[2, 0, 0] == pytest.approx(variance)
-
-
-def test_time_that_goes_back_forgets():
-    drive = Drive()
-    drive.grid(0, 5)
-    assert OBSTACLE not in drive.grid(0, 1, (FLOOR, LANDING)).classes
 
 
 def test_a_thinned_cloud_has_a_point_of_every_cube_that_has_any():

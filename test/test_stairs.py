@@ -8,20 +8,19 @@ import numpy as np
 import pytest
 from pytest import approx
 from scipy.spatial.transform import Rotation
+from terrain_scenes import FLOOR, scene
 
 from rangeseg_ros import Config, RangeImage, Segmenter
 from rangeseg_ros.batch.frame_files import write_frame
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE
 from rangeseg_ros.evaluation.stairs import StairsCheck, check_stairs, stairs_figures, stairs_line
-from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.sensors.kinect import Kinect
 from rangeseg_ros.simulation.sensors.sensor import resize
 from rangeseg_ros.simulation.solids import box
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
-from rangeseg_ros.simulation.terrain.scene import ALL, Piece, Terrain, slab
+from rangeseg_ros.simulation.terrain.scene import ALL, Piece, slab
 
 CAMERA = resize(Kinect().camera, 320, 240)
-FLOOR = slab(-3, 12, 0, 0, ALL)
 
 
 def treads(edge, rise, run, class_, sides):
@@ -36,17 +35,15 @@ def up_stairs(sides):
     return treads(1.9, 0.17, 0.28, OBSTACLE, sides)
 
 
-def seen(*pieces, height=1.5, pitch=35, yaw=0):
-    pose = Pose.looking((0, 0, height), yaw, pitch, 2)
-    terrain = Terrain('', pieces, (FLOOR,), pose)
-    frame = simulate_terrain(terrain, Kinect(), CAMERA)
-    config = Config(**up_of(terrain.up), sensor_height=height)
-    image = RangeImage.from_depth(frame.depth, CAMERA)
-    return terrain, image, Segmenter(config).segment(image)
-
-
 def up_of(up):
     return dict(zip(('up_x', 'up_y', 'up_z'), map(float, up), strict=True))
+
+
+def seen(*pieces, yaw=0):
+    terrain = scene(*pieces, pitch=35, roll=2, yaw=yaw, height=1.5)
+    image = RangeImage.from_depth(simulate_terrain(terrain, Kinect(), CAMERA).depth, CAMERA)
+    config = Config(**up_of(terrain.up), sensor_height=1.5)
+    return terrain, image, Segmenter(config).segment(image)
 
 
 @pytest.mark.parametrize(
@@ -116,15 +113,14 @@ def test_treads_follow_each_other(sides, count):
 @pytest.mark.parametrize('axis', [(1, 0, 0), (-1, 0, 0), (0, 0, 1)])
 def test_a_tilted_camera_is_noticed_and_said(axis, segment_image):
     wall = Piece(box((1, 20, 6), np.eye(3), (3.5, 0, 0)), OBSTACLE, 3.0)
-    terrain, _, straight = seen(Piece(FLOOR, GROUND), wall)
+    terrain, image, straight = seen(Piece(FLOOR, GROUND), wall)
     assert straight.tilt is None
     wrong = Rotation.from_rotvec(np.radians(20) * np.array(axis)).apply(terrain.up)
-    frame = simulate_terrain(terrain, Kinect(), CAMERA)
-    config = Config(**up_of(wrong))
-    tilt = Segmenter(config).segment(RangeImage.from_depth(frame.depth, CAMERA)).tilt
+    tilt = Segmenter(Config(**up_of(wrong))).segment(image).tilt
     assert tilt.degrees == approx(np.degrees(np.arccos(wrong @ terrain.up)), abs=2)
     assert tilt.up == approx(terrain.up, abs=0.03)
-    code, _, error = segment_image(frame.depth, CAMERA, **up_of(wrong))
+    depth = simulate_terrain(terrain, Kinect(), CAMERA).depth
+    code, _, error = segment_image(depth, CAMERA, **up_of(wrong))
     assert code == 0 and 'up as stated, or of a level camera, is off by' in error
 
 
