@@ -41,11 +41,11 @@ def matrix_of(transform):
     return matrix
 
 
-def fill(buffer, parent, child, motion, stamps, signs=(1,)):
+def fill(buffer, parent, child, motion, stamps, signs=(1,), static=False):
     """Take in samples of a motion; q and -q are one rotation."""
     for stamp, sign in zip(stamps, cycle(signs), strict=False):
         turn, place = motion.at(stamp / SECOND)
-        buffer.insert(parent, child, stamp, sign * turn.as_quat(), place)
+        buffer.insert(parent, child, stamp, sign * turn.as_quat(), place, static)
 
 
 @settings(max_examples=60, deadline=None)
@@ -61,13 +61,11 @@ def test_lookups_in_random_trees_equal_the_closed_form(data):
     order = np.random.default_rng(seed).permutation(stamps).tolist()
     buffer, motions = TransformBuffer(), {}
     for k, parent in enumerate(parents, start=1):
-        motion = motions[k] = Motion([seed, k])
-        if data.draw(st.booleans()):
+        motion, static = Motion([seed, k]), data.draw(st.booleans())
+        if static:
             motion.turning[:], motion.velocity[:] = 0, 0
-            turn, place = motion.at(0)
-            buffer.insert(f'f{parent}', f'f{k}', 0, turn.as_quat(), place, static=True)
-        else:
-            fill(buffer, f'f{parent}', f'f{k}', motion, order, signs)
+        motions[k] = motion
+        fill(buffer, f'f{parent}', f'f{k}', motion, [0] if static else order, signs, static)
 
     def to_root(k, seconds):
         matrix = np.eye(4)
@@ -172,17 +170,11 @@ def test_matrices_that_are_no_motion_are_refused():
             Transform.from_matrix(matrix)
 
 
-TURNS = np.concatenate(
-    [
-        Rotation.random(1000, random_state=0).as_rotvec(),
-        np.eye(3)[:, None].repeat(3, 1).reshape(-1, 3) * np.tile([1e-9, 1e-4, np.pi], 3)[:, None],
-        np.zeros((1, 3)),
-    ]
-)
-
-
 def test_quaternions_and_matrices_of_turns():
-    turns, truth = Rotation.from_rotvec(TURNS).as_matrix(), Rotation.from_rotvec(TURNS).as_quat()
+    about_axes = np.kron([[1e-9], [1e-4], [np.pi], [0.0]], np.eye(3))
+    vectors = np.concatenate([Rotation.random(1000, random_state=0).as_rotvec(), about_axes])
+    rotations = Rotation.from_rotvec(vectors)
+    turns, truth = rotations.as_matrix(), rotations.as_quat()
     found = quaternions(turns)
     assert (found[:, 3] >= 0).all()
     assert np.allclose(np.linalg.norm(found, axis=1), 1, rtol=0, atol=1e-15)
@@ -192,17 +184,13 @@ def test_quaternions_and_matrices_of_turns():
     # One alone is that of many.
     assert [quaternions(turn).tolist() for turn in turns] == found.tolist()
     assert quaternions(turns[:0]).shape == (0, 4)
-    for turn in TURNS:
-        truth = Rotation.from_rotvec(turn)
-        assert np.abs(rotation_matrix(truth.as_quat()) - truth.as_matrix()).max() < 1e-15
-        assert np.abs(rotation_by(turn) - truth.as_matrix()).max() < 1e-15
+    for function, arguments in ((rotation_matrix, truth), (rotation_by, vectors)):
+        assert np.abs(np.stack([function(v) for v in arguments]) - turns).max() < 1e-15
 
 
 @pytest.mark.parametrize('level', [0.05, 0.5, 0.99, LEVEL])
 def test_quantiles(level):
-    for freedom in (0.5, 1, 2, 3, 6, 9, 13, 15.7, 60):
-        expected = chi2.ppf(level, freedom)
-        assert chi2_quantile(freedom, level) == pytest.approx(expected, rel=1e-10)
-    for freedom, others in ((0.5, 100), (3, 2), (6, 22), (13, 9.5)):
-        expected = f.ppf(level, freedom, others)
-        assert f_quantile(freedom, others, level) == pytest.approx(expected, rel=1e-8)
+    for n in (0.5, 1, 2, 3, 6, 9, 13, 15.7, 60):
+        assert chi2_quantile(n, level) == pytest.approx(chi2.ppf(level, n), rel=1e-10)
+    for n, m in ((0.5, 100), (3, 2), (6, 22), (13, 9.5)):
+        assert f_quantile(n, m, level) == pytest.approx(f.ppf(level, n, m), rel=1e-8)
