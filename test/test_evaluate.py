@@ -187,20 +187,6 @@ def write(path, labels):
     return path
 
 
-def test_two_png_files(tmp_path, figures_of):
-    # Truth 1: 4 pixels, all in found 5 (5 pixels): (1, 0.8). Truth 2: 3 pixels, 2 in found 6.
-    truth = write(tmp_path / 'truth.png', [[1, 1, 1, 1, 2, 2, 2, 0]])
-    labels = write(tmp_path / 'labels.png', [[5, 5, 5, 5, 5, 6, 6, 0]])
-    code, figures, *_ = figures_of('compare', truth, labels, '--tolerance', '0.8', '0.9')
-    assert code == 0
-    names = 'regions', 'correct', 'over', 'under', 'missed', 'noise', 'mean_iou', 'pixel_accuracy'
-    shares = pytest.approx((4 / 5 + 2 / 3) / 2), pytest.approx(6 / 7)
-    assert figures['tolerances'] == {
-        '0.8': dict(zip(names, (2, 1, 0, 0, 1, 1, *shares), strict=True)),
-        '0.9': dict(zip(names, (2, 0, 0, 0, 2, 2, *shares), strict=True)),
-    }
-
-
 def test_rasters_count_regions_from_ten(tmp_path, figures_of):
     # 0-3 are no regions on either side, so nothing is noise.
     truth = write(tmp_path / 'abw.test.1.gt-seg', [[10, 10, 2, 3], [11, 11, 0, 1]])
@@ -218,11 +204,9 @@ def test_folders_are_paired_by_name_and_summed(tmp_path, figures_of):
     write(tmp_path / 'ms/2_depth_labels.png', [[1, 1, 0]])
     write(tmp_path / 'ms/10_depth_labels.png', [[0, 2, 3]])
     write(tmp_path / 'ms/10_depth_overlay.png', [[9, 9, 9]])
-    code, figures, *_ = figures_of(
-        'compare', tmp_path / 'gt', tmp_path / 'ms', '--tolerance', '0.8'
-    )
-    assert code == 0
-    assert figures['images'] == 2
+    folders = tmp_path / 'gt', tmp_path / 'ms'
+    code, figures, *_ = figures_of('compare', *folders, '--tolerance', '0.8')
+    assert code == 0 and figures['images'] == 2
     row = figures['tolerances']['0.8']
     assert (row['regions'], row['correct'], row['missed'], row['noise']) == (3, 2, 1, 1)
     # Over all three regions and four pixels, not the mean of two images.
@@ -232,7 +216,11 @@ def test_folders_are_paired_by_name_and_summed(tmp_path, figures_of):
     assert figures['per_image']['10']['tolerances']['0.8']['missed'] == 1
 
 
+NAMES = 'regions', 'correct', 'over', 'under', 'missed', 'noise', 'mean_iou', 'pixel_accuracy'
+SHARES = pytest.approx((4 / 5 + 2 / 3) / 2), pytest.approx(6 / 7)
 NONE = 65535
+# Truth 1: 4 pixels, all in found 5 (5 pixels): (1, 0.8). Truth 2: 3 pixels, 2 in found 6.
+TWO = [1, 1, 1, 1, 2, 2, 2, 0], [5, 5, 5, 5, 5, 6, 6, 0]
 # Found 7 has four pixels, of which one is not judged and one judged curved: 2 / 3. Without 65535
 # in the truth every pixel counts: 2 / 4.
 CURVED, FLAT, WIDE = [1, 1, 0, NONE, NONE], [1, 1, 0, 0, 0], [7, 7, 7, 7, 0]
@@ -243,24 +231,27 @@ HALF = [7] * 8 + [8] * 4 + [0] * 3
 
 
 @pytest.mark.parametrize(
-    ('truth', 'labels', 'least', 'expected'),
+    ('tolerance', 'truth', 'labels', 'least', 'expected'),
     [
-        (CURVED, WIDE, 1, {'regions': 1, 'noise': 1, 'mean_iou': pytest.approx(2 / 3)}),
-        (FLAT, WIDE, 1, {'mean_iou': 1 / 2}),
-        (RIM, PARTS, 1, {'correct': 0, 'over': 1, 'noise': 0}),
-        (RIM, PARTS, 3, {'correct': 1, 'over': 0, 'noise': 0}),
-        (RIM, HALF, 3, {'over': 1}),
-        ([1, 1, 1, 2], [1, 1, 1, 0], 1, {'missed': 1}),
-        ([1, 1, 1, 2], [1, 1, 1, 0], 2, {'regions': 1, 'missed': 0}),
-        ([0, 0], [0, 0], 1, {'mean_iou': None}),
+        ('0.8', *TWO, 1, dict(zip(NAMES, (2, 1, 0, 0, 1, 1, *SHARES), strict=True))),
+        ('0.9', *TWO, 1, {'correct': 0, 'missed': 2, 'noise': 2}),
+        ('0.8', CURVED, WIDE, 1, {'regions': 1, 'noise': 1, 'mean_iou': pytest.approx(2 / 3)}),
+        ('0.8', FLAT, WIDE, 1, {'mean_iou': 1 / 2}),
+        ('0.8', RIM, PARTS, 1, {'correct': 0, 'over': 1, 'noise': 0}),
+        ('0.8', RIM, PARTS, 3, {'correct': 1, 'over': 0, 'noise': 0}),
+        ('0.8', RIM, HALF, 3, {'over': 1}),
+        ('0.8', [1, 1, 1, 2], [1, 1, 1, 0], 1, {'missed': 1}),
+        ('0.8', [1, 1, 1, 2], [1, 1, 1, 0], 2, {'regions': 1, 'missed': 0}),
+        ('0.8', [0, 0], [0, 0], 1, {'mean_iou': None}),
     ],
 )
 def test_what_is_not_judged_or_too_small_does_not_count(
-    tmp_path, figures_of, truth, labels, least, expected
+    tmp_path, figures_of, tolerance, truth, labels, least, expected
 ):
     truth, labels = (write(tmp_path / f'{k}.png', [row]) for k, row in enumerate((truth, labels)))
-    row = figures_of('compare', truth, labels, '--min-pixels', least)[1]['tolerances']['0.8']
-    assert {name: row[name] for name in expected} == expected
+    _, figures, *_ = figures_of('compare', truth, labels, '--min-pixels', least)
+    row = figures['tolerances'][tolerance]
+    assert {name: row[name] for name in expected} == expected and set(row) == {*NAMES}
 
 
 def test_refusals_of_compare(tmp_path, refused):

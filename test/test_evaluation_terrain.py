@@ -48,13 +48,14 @@ SHARES += [
 ]
 
 
-def shares(*values):
-    return dict(zip(SHARES, values, strict=True))
-
-
-KINECT = shares(800 / 1080, 140 / 1080, 140 / 1080, 140 / 240, 100 / 240, 140 / 440, 300 / 440)
-REALSENSE = shares(800 / 940, 140 / 940, 0.0, 140 / 240, 100 / 240, 140 / 340, 200 / 340)
-POOLED = shares(1600 / 2020, 280 / 2020, 140 / 2020, 280 / 480, 200 / 480, 280 / 780, 500 / 780)
+KINECT, REALSENSE, POOLED = (
+    dict(zip(SHARES, values, strict=True))
+    for values in (
+        (800 / 1080, 140 / 1080, 140 / 1080, 140 / 240, 100 / 240, 140 / 440, 300 / 440),
+        (800 / 940, 140 / 940, 0.0, 140 / 240, 100 / 240, 140 / 340, 200 / 340),
+        (1600 / 2020, 280 / 2020, 140 / 2020, 280 / 480, 200 / 480, 280 / 780, 500 / 780),
+    )
+)
 
 
 @pytest.fixture
@@ -116,13 +117,19 @@ def test_the_height_in_the_table_is_told_unless_it_shall_not_be(drawn, evaluate)
     assert evaluate(drawn, '--unknown-height')[1]['pooled'] == pytest.approx(POOLED)
 
 
+NO_CLASS = np.full(CAMERA.shape, 4, np.uint8)
+
+
 @pytest.mark.parametrize(
     ('damage', 'says'),
     [
         (lambda folder: (folder / 'truth/kinect.png').unlink(), 'truth/kinect.png: No such file'),
         (lambda folder: cut(folder / 'truth/kinect.png'), 'truth/kinect.png: truth is 8x4'),
         (lambda folder: cut(folder / 'crossing/kinect.tiff'), 'kinect.tiff: depth image is 8x4'),
-        (lambda folder: write_class(folder, 4), 'truth/kinect.png: 4 is no class'),
+        (
+            lambda folder: write_image(folder / 'truth/kinect.png', NO_CLASS),
+            'truth/kinect.png: 4 is no class',
+        ),
         (lambda folder: change(folder, 'kind,sensor', 'sort,sensor'), 'malformed table'),
         (lambda folder: change(folder, ',-1,2,', ',-1,high,'), 'malformed table'),
         (lambda folder: change(folder, ',-1,2,,,,', ''), 'malformed table'),
@@ -135,12 +142,6 @@ def test_errors_are_one_line(drawn, refused, damage, says):
 
 def cut(path):
     write_image(path, cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:4, :8])
-
-
-def write_class(folder, number):
-    image = np.zeros(CAMERA.shape, np.uint8)
-    image[0, 0] = number
-    write_image(folder / 'truth/kinect.png', image)
 
 
 def change(folder, old, new):

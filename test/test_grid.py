@@ -93,14 +93,6 @@ def test_without_poses_or_where_time_goes_back_the_grid_is_of_one_image(posed, s
     assert OBSTACLE not in grid.classes and (grid.classes == GROUND).sum() > 300
 
 
-def test_a_height_is_remembered_as_long_as_planes_are():
-    memory = GroundMemory(Config(track_time=3.0))
-    memory.keep_height(1.2, 10**9)
-    assert [memory.recall_height(int(s * 1e9)) for s in (1, 3.9, 4.1)] == [1.2, 1.2, 0]
-    memory.forget()
-    assert memory.recall_height(10**9) == 0
-
-
 @pytest.mark.parametrize(
     ('second', 'height', 'variance'),
     [(0.15, 0.14, 8e-5), (0.05, 0.06, 8e-5), (0.2, 0.2, 1e-4), (0.0, 0.0, 1e-4)],

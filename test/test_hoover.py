@@ -27,11 +27,6 @@ def test_labels_are_integers():
         Overlap.between(np.zeros((2, 2)), np.zeros((2, 2), int))
 
 
-def share(region, other):
-    """Part of the pixels of a region that are in another one."""
-    return other[region].mean()
-
-
 def literal(truth, labels, tolerance):
     """Classes as the reference tool is described, region by region and in its order."""
     of_truth, of_labels = (
@@ -39,17 +34,17 @@ def literal(truth, labels, tolerance):
         for image in (truth, labels)
     )
     for n, m in itertools.product(of_truth, of_labels):
-        shares = share(truth == n, labels == m), share(labels == m, truth == n)
+        shares = (labels == m)[truth == n].mean(), (truth == n)[labels == m].mean()
         if min(shares) >= tolerance:
             of_truth[n] = of_labels[m] = RegionClass.CORRECT, np.mean(shares)
 
     def split(kind, whole, of_whole, other, of_other):
         for n, (_, before) in of_whole.items():
-            parts = [m for m in of_other if share(other == m, whole == n) >= tolerance]
+            parts = [m for m in of_other if (whole == n)[other == m].mean() >= tolerance]
             if len(parts) < 2:
                 continue
             together = np.isin(other, parts)
-            shares = share(whole == n, together), share(together, whole == n)
+            shares = together[whole == n].mean(), (whole == n)[together].mean()
             if min(shares) >= tolerance and np.mean(shares) > before:
                 of_whole[n] = kind, np.mean(shares)
                 of_other.update(dict.fromkeys(parts, of_whole[n]))
@@ -89,8 +84,7 @@ def test_overlap_figures_by_hand():
     assert figures['pixel_accuracy'] == pytest.approx(12 / 21)
     assert figures['precision'] == figures['recall'] == 0
     figures = overlap_figures([item], threshold=0.6)
-    assert figures['precision'] == pytest.approx(2 / 3)
-    assert figures['recall'] == pytest.approx(2 / 3)
+    assert figures['precision'] == figures['recall'] == pytest.approx(2 / 3)
 
 
 def test_figures_are_of_the_best_assignment_and_pooled_over_images():
@@ -111,19 +105,16 @@ def test_angle_errors_of_correct_pairs():
     angles = [(10, 11, 88.0), (10, 12, 0.0), (11, 13, 45.0)]
     assert angle_errors(angles, normals, matches) == pytest.approx([2.0, np.degrees(0.1)])
     # 174 degrees and 6 degrees are one angle between planes.
-    assert angle_errors([(10, 12, 174.0)], normals, matches) == pytest.approx(
-        [6 - np.degrees(0.1)]
-    )
+    acute = angle_errors([(10, 12, 174.0)], normals, matches)
+    assert acute == pytest.approx([6 - np.degrees(0.1)])
     assert angle_errors([], normals, matches).shape == (0,)
 
 
 def test_plane_errors():
     tilt = np.radians(3)
     truth = {1: (0, 0, -1, 2.0), 2: (0, -1, 0, 1.0), 3: (1, 0, 0, 1)}
-    found = {
-        7: (0, -np.sin(tilt), -np.cos(tilt), 2.01),
-        8: (0, 1, 0, -1.5),  # the same plane with the other sign
-    }
+    # 8 is the same plane with the other sign.
+    found = {7: (0, -np.sin(tilt), -np.cos(tilt), 2.01), 8: (0, 1, 0, -1.5)}
     errors = plane_errors(truth, found, {1: 7, 2: 8, 3: 9, 4: 7})
     assert errors == pytest.approx(np.array([[3.0, 0.01], [0.0, 0.5]]))
     assert plane_errors(truth, found, {}).shape == (0, 2)
