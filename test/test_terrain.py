@@ -210,7 +210,8 @@ def test_what_was_the_ground_stays_it_while_it_is_out_of_view():
     def share(name, second, class_):
         return (ground_at(name, second).classes[images[name].valid] == class_).mean()
 
-    # Of itself, each of them is the ground.
+    # Of itself, each of them is the ground, but for the wall.
+    assert share('wall', 0.0, OBSTACLE) > 0.999
     for name in ('table', 'landing', 'floor'):
         assert share(name, 0.0, GROUND) > 0.9
         sequence = SequenceSegmenter(Config())
@@ -229,14 +230,6 @@ def test_what_was_the_ground_stays_it_while_it_is_out_of_view():
     assert share('landing', 1.6 + patience, GROUND) > 0.9
     # Where time begins anew, nothing is known.
     assert share('table', 0.0, GROUND) > 0.95
-
-
-def test_a_view_without_floor_has_no_ground():
-    wall = Piece(box((1, 20, 12), np.eye(3), (1.9, 0, 0)), OBSTACLE, 4.0)
-    for height in (HEIGHT, 0.0):
-        _, result, frame = found(scene(wall, Piece(FLOOR, GROUND), pitch=0), height)
-        assert (result.terrain != GROUND).mean() > 0.999
-        assert (result.terrain == OBSTACLE)[frame.depth > 0].mean() > 0.99
 
 
 def test_a_chain_goes_on_a_while_after_what_is_off_the_ground():
