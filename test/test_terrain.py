@@ -24,27 +24,17 @@ from rangeseg_ros.simulation.terrain.scene import ALL, FAR, Piece, slab
 CAMERA = resize(Kinect().camera, 320, 240)
 
 
-def box_at(ahead, size, centre=0.0):
-    length, width, height = size
-    place = ahead + length / 2, centre, height / 2
-    return Piece(box((length, width, height), np.eye(3), place), OBSTACLE, height)
-
-
 def stated_to_be(up, height, **parameters):
     directions = dict(zip(('up_x', 'up_y', 'up_z'), map(float, up), strict=True))
     return Config(**directions, sensor_height=height, **parameters)
 
 
-def up_of(terrain):
-    """Off by 1 degree per axis."""
-    return Rotation.from_euler('xyz', [1, -1, 1], degrees=True).apply(terrain.up)
-
-
 def found(terrain, height=HEIGHT, **parameters):
-    """What is found of a scene, and the truth."""
+    """What is found of a scene with an up that is 1 degree per axis off, and the truth."""
+    up = Rotation.from_euler('xyz', [1, -1, 1], degrees=True).apply(terrain.up)
     frame = simulate_terrain(terrain, Kinect(), CAMERA)
     image = RangeImage.from_depth(frame.depth, CAMERA)
-    config = stated_to_be(up_of(terrain), height, **parameters)
+    config = stated_to_be(up, height, **parameters)
     return image, Segmenter(config).segment(image), frame
 
 
@@ -78,8 +68,11 @@ def test_a_mirage_in_the_floor_is_a_drop():
 
 
 def test_a_whole_object_is_an_obstacle_and_has_its_height():
-    boxes = box_at(1.6, (0.3, 0.5, 0.08), -0.4), box_at(1.8, (0.3, 0.4, 0.4), 0.4)
-    _, result, frame = found(scene(*boxes, Piece(FLOOR, GROUND)))
+    low, high = (
+        Piece(box(size, np.eye(3), (*place, size[2] / 2)), OBSTACLE, size[2])
+        for size, place in (((0.3, 0.5, 0.08), (1.75, -0.4)), ((0.3, 0.4, 0.4), (1.95, 0.4)))
+    )
+    _, result, frame = found(scene(low, high, Piece(FLOOR, GROUND)))
     assert share(result.terrain, frame, OBSTACLE, OBSTACLE) > 0.97
     assert share(result.terrain, frame, GROUND, GROUND) > 0.99
     known = np.isfinite(frame.height) & (frame.depth < 3000)
