@@ -91,7 +91,7 @@ def test_ground_leads_over_gaps_that_the_robot_crosses(gap, kept):
         Piece(slab(1.2, 1.5, -1, -1, ALL), DROP, 1.0),
         Piece(slab(1.5, FAR, 0, 0, ALL), GROUND),
     )
-    config = Config(ground_gap=gap, robot_radius=gap + 0.1)
+    config = Config(ground_gap=gap, robot_radius=0.6)
     terrain, frame = judged(pieces, 28, ABOVE, config=config)
     beyond = (frame.terrain == GROUND) & (frame.depth > 2100) & (frame.depth < 2600)
     assert beyond.sum() > 1000

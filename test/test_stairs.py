@@ -20,7 +20,7 @@ from rangeseg_ros.simulation.solids import box
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
 from rangeseg_ros.simulation.terrain.scene import ALL, Piece, slab
 
-CAMERA = resize(Kinect().camera, 320, 240)
+CAMERA, SIDES = resize(Kinect().camera, 320, 240), (-0.5, 0.6)
 
 
 def treads(edge, rise, run, class_, sides):
@@ -29,10 +29,6 @@ def treads(edge, rise, run, class_, sides):
         level, begin = k * rise if class_ == OBSTACLE else -k * rise, edge + (k - 1) * run
         end = begin + run + 3 * (k == len(sides))
         yield Piece(slab(begin, end, level, level, y), class_, abs(level))
-
-
-def up_stairs(sides):
-    return treads(1.9, 0.17, 0.28, OBSTACLE, sides)
 
 
 def up_of(up):
@@ -51,16 +47,16 @@ def seen(*pieces, yaw=0):
     [('up', 1.9, 3, 0.17, 0.28), ('down', 1.3, 4, 0.16, 0.3)],
 )
 def test_edge_count_rise_and_run(direction, begin, count, rise, run, tmp_path):
-    sides, class_ = (-0.5, 0.6), OBSTACLE if direction == 'up' else DROP
+    class_ = OBSTACLE if direction == 'up' else DROP
     floor = FLOOR if direction == 'up' else slab(-3, begin, 0, 0, ALL)
-    pieces = Piece(floor, GROUND), *treads(begin, rise, run, class_, count * [sides])
+    pieces = Piece(floor, GROUND), *treads(begin, rise, run, class_, count * [SIDES])
     terrain, image, result = seen(*pieces, yaw=10)
     (stairs,) = result.stairs
     assert (stairs.direction, stairs.count) == (direction, count)
     assert stairs.rise == approx(rise, abs=0.01) and stairs.run == approx(run, abs=0.025)
     assert stairs.width == approx(1.1, abs=0.1)
     edge = stairs.edge @ terrain.pose.rotation.T + terrain.pose.position
-    assert edge[:, 0] == approx(begin, abs=0.06) and np.sort(edge[:, 1]) == approx(sides, abs=0.08)
+    assert edge[:, 0] == approx(begin, abs=0.06) and np.sort(edge[:, 1]) == approx(SIDES, abs=0.08)
     assert np.abs(edge[:, 2]).max() < 0.03
     # It is written as the contract says, and survives another process.
     path = write_frame(tmp_path, 'a', image, pickle.loads(pickle.dumps(result)), ['stairs'])
@@ -72,7 +68,9 @@ def test_edge_count_rise_and_run(direction, begin, count, rise, run, tmp_path):
 
 
 def test_the_edge_is_in_the_frame_of_a_cloud():
-    terrain, image, result = seen(Piece(FLOOR, GROUND), *up_stairs(3 * [(-0.5, 0.6)]))
+    terrain, image, result = seen(
+        Piece(FLOOR, GROUND), *treads(1.9, 0.17, 0.28, OBSTACLE, 3 * [SIDES])
+    )
     turn, place = Rotation.from_rotvec((1.3, -0.7, 2.1)).as_matrix(), np.array([0.3, 0.2, 0.8])
     cloud = RangeImage.from_points((image.points @ turn.T + place).astype(np.float32))
     config = Config(**up_of(turn @ terrain.up), sensor_height=1.5)
@@ -82,32 +80,25 @@ def test_the_edge_is_in_the_frame_of_a_cloud():
     assert min(np.abs(stairs.edge - order).max() for order in (ends, ends[::-1])) < 0.02
 
 
-def test_boxes_side_by_side_and_one_step_are_no_stairs():
-    boxes = [
-        Piece(box((0.3, 0.3, h), np.eye(3), (1.6 + 0.1 * k, 0.4 * k - 0.4, h / 2)), OBSTACLE, h)
-        for k, h in enumerate((0.15, 0.3, 0.45))
-    ]
-    curb = Piece(slab(1.9, 12, 0.17, 0.17, ALL), OBSTACLE, 0.17)
-    for pieces in (boxes, [curb]):
-        result = seen(*pieces, Piece(FLOOR, GROUND))[2]
-        # Nothing is worked out unless it is asked for.
-        assert not {'ground', 'stairs'} & set(vars(result))
-        assert result.stairs == [] and 'ground' in vars(result)
-
-
 @pytest.mark.parametrize(
-    ('sides', 'count'),
+    ('run', 'sides', 'count'),
     [
+        (0.28, [ALL], None),
+        (0.2, 3 * [SIDES], None),
+        (0.45, 3 * [SIDES], None),
         # Noses as wide as treads share, of which each next pair has half in common, or less.
-        ([(-0.8 + 0.3 * k, 0.2 + 0.3 * k) for k in range(3)], 3),
-        ([(-0.2 - 0.35 * k, 0.8 - 0.35 * k) for k in range(3)], None),
+        (0.28, [(-0.8 + 0.3 * k, 0.2 + 0.3 * k) for k in range(3)], 3),
+        (0.28, [(-0.2 - 0.35 * k, 0.8 - 0.35 * k) for k in range(3)], None),
         # No column sees the third tread and the fourth.
-        ([(-0.6, 0.6), (-0.6, 0.6), (0, 0.6), (-0.6, 0), (-0.6, 0)], 3),
+        (0.28, [(-0.6, 0.6), (-0.6, 0.6), (0, 0.6), (-0.6, 0), (-0.6, 0)], 3),
     ],
 )
-def test_treads_follow_each_other(sides, count):
-    found = seen(*up_stairs(sides), Piece(FLOOR, GROUND))[2].stairs
-    assert [stairs.count for stairs in found] == [count] * (count is not None)
+def test_treads_are_as_deep_as_is_built_and_follow_each_other(run, sides, count):
+    result = seen(Piece(FLOOR, GROUND), *treads(1.9, 0.17, run, OBSTACLE, sides))[2]
+    # Nothing is worked out unless it is asked for.
+    assert not {'ground', 'stairs'} & set(vars(result))
+    assert [stairs.count for stairs in result.stairs] == ([count] if count else [])
+    assert 'ground' in vars(result)
 
 
 @pytest.mark.parametrize('axis', [(1, 0, 0), (-1, 0, 0), (0, 0, 1)])
