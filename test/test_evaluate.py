@@ -22,6 +22,7 @@ from rangeseg_ros.io.params import read_config, read_params
 from rangeseg_ros.io.tables import write_table
 from rangeseg_ros.segcomp import abw_calibration
 
+ROOT = Path(__file__).parents[1]
 CAMERA = Camera(96, 72, 90.0, 90.0, 47.5, 35.5)
 # Two walls that meet in the vertical line x = 0, z = 2.
 LEFT = np.array([np.sqrt(0.5), 0.0, -np.sqrt(0.5), 2 * np.sqrt(0.5)])
@@ -265,9 +266,6 @@ def test_refusals_of_compare(tmp_path, refused):
         (f'{extra}: no segmentation', extra.parent, one.parent),
     ):
         assert words in refused('compare', *arguments)
-
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.parametrize(('name', 'count'), [('lambda', 3), ('comparison', 3 * 6 + 9)])

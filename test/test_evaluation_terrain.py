@@ -40,6 +40,7 @@ CROSSING = (
     (np.s_[80:90, 110:120], 3.0),  # 100 of the drop that is floor
     (np.s_[80:90, 120:130], 3.6),  # 100 of them
 )
+NO_CLASS, FLAT = np.full(CAMERA.shape, 4, np.uint8), np.ones(CAMERA.shape, np.float32)
 # Reaches of 3.5 and of 2.5 m: pixels by true and found class, as the comments above add up.
 SENSORS = {'kinect': 'near', 'realsense': 'far'}
 SHARES = [f'ground_{name}' for name in ('kept', 'called_obstacle', 'called_drop')]
@@ -113,9 +114,6 @@ def test_the_height_in_the_table_is_told_unless_it_shall_not_be(drawn, evaluate)
     change(drawn, '-1,2,', '-1,2.2,')
     assert evaluate(drawn)[1]['by_kind']['near']['ground_kept'] == 0
     assert evaluate(drawn, '--unknown-height')[1]['pooled'] == pytest.approx(POOLED)
-
-
-NO_CLASS, FLAT = np.full(CAMERA.shape, 4, np.uint8), np.ones(CAMERA.shape, np.float32)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,8 @@ from rangeseg_ros.evaluation.hoover import RegionClass, classify
 from rangeseg_ros.evaluation.overlap import ComparisonError, Overlap, overlap_figures
 from rangeseg_ros.evaluation.plane_errors import angle_errors, plane_errors
 
+RUN = st.tuples(st.integers(0, 3), st.integers(0, 3), st.integers(1, 30))
+
 
 def images(*runs):
     """Two one-row images given as runs (truth label, found label, pixels)."""
@@ -54,12 +56,7 @@ def literal(truth, labels, tolerance):
     return [[kind for kind, _ in classes.values()] for classes in (of_truth, of_labels)]
 
 
-RUNS = st.lists(
-    st.tuples(st.integers(0, 3), st.integers(0, 3), st.integers(1, 30)), min_size=1, max_size=9
-)
-
-
-@given(RUNS, st.sampled_from([0.51, 0.6, 0.75, 0.8, 0.9, 1.0]))
+@given(st.lists(RUN, min_size=1, max_size=9), st.sampled_from([0.51, 0.6, 0.75, 0.8, 0.9, 1.0]))
 @example([(1, 1, 45), (1, 2, 3), (0, 2, 2), (1, 0, 27)], 0.6)
 @example([(1, 1, 80), (1, 2, 15), (1, 0, 5), (2, 1, 10)], 0.8)
 @example([(1, 1, 45), (2, 1, 3), (2, 0, 2), (0, 1, 27)], 0.6)

@@ -22,8 +22,6 @@ pytestmark = pytest.mark.ros
 
 HEIGHT, WALL = 0.8, 3.0
 GRAVITY = 9.81
-
-
 node, bench = benches('labels', 'planes')
 
 

@@ -1,5 +1,7 @@
 """Observed normals of exact planes, and the directions that are labels (thesis, A.1 and A.3)."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,8 @@ from rangeseg_ros.core.by_normals.normals import cross_product, observed_normals
 from rangeseg_ros.core.sensing.grid import Grid
 
 CAMERA = Camera(40, 30, 50.0, 55.0, 19.0, 15.5)
+BOTH = [*product((cross_product, plane_fit), (1, 3))]
+METHODS = pytest.mark.parametrize(('method', 'reach'), BOTH)
 
 
 def plane_image(normal, distance, camera=CAMERA):
@@ -20,14 +24,10 @@ def plane_image(normal, distance, camera=CAMERA):
     return RangeImage.from_depth(depth, camera)
 
 
-NORMALS = [(0, 0, -1), (0.3, -0.4, -np.sqrt(0.75)), (-0.6, 0.0, -0.8), (0, -0.8, -0.6)]
-METHODS = pytest.mark.parametrize('method', [cross_product, plane_fit])
-REACHES = pytest.mark.parametrize('reach', [1, 3])
-
-
 @METHODS
-@REACHES
-@pytest.mark.parametrize('normal', NORMALS)
+@pytest.mark.parametrize(
+    'normal', [(0, 0, -1), (0.3, -0.4, -np.sqrt(0.75)), (-0.6, 0.0, -0.8), (0, -0.8, -0.6)]
+)
 def test_normal_of_an_exact_plane(normal, method, reach):
     image = plane_image(normal, 1.7)
     found = method(image, reach)
@@ -39,7 +39,6 @@ def test_normal_of_an_exact_plane(normal, method, reach):
 
 
 @METHODS
-@REACHES
 def test_clouds_of_another_frame_point_to_the_sensor_too(method, reach):
     """The wall x = 2 in front of a scanner that looks along x."""
     azimuth = np.radians(np.linspace(-20, 20, 40))[None, :]
@@ -51,7 +50,6 @@ def test_clouds_of_another_frame_point_to_the_sensor_too(method, reach):
 
 
 @METHODS
-@REACHES
 def test_undefined_at_the_border_and_beside_shadow_and_nowhere_else(method, reach):
     depth = plane_image((0, 0, -1), 1.0).points[..., 2].copy()
     depth[15, 20] = np.nan

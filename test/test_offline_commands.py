@@ -13,12 +13,11 @@ from rangeseg_ros.cli import segment
 from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.images import read_labels, write_image
 
+CAMERA = '--camera', 'camera.yaml'
+
 
 def files(folder):
     return sorted(str(path.relative_to(folder)) for path in folder.rglob('*') if path.is_file())
-
-
-CAMERA = '--camera', 'camera.yaml'
 
 
 def test_segment_writes_labels_overlay_and_planes(folder, run):

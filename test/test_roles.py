@@ -79,8 +79,7 @@ def test_a_ramp_says_how_steep_it_is_and_where_it_climbs(degrees, role):
         (told,) = ramps_of(found, np.array((0, -1.0, 0)))
         assert told.plane == found[1].id and str(told) == 'ramp 8 degrees'
         assert told.slope == pytest.approx(8, abs=0.01)
-        ahead = np.sign(degrees)
-        climb = 0, -np.sin(abs(angle)), ahead * np.cos(angle)
+        climb = np.sign(degrees) * np.array((0, -np.sin(angle), np.cos(angle)))
         np.testing.assert_allclose(told.climb, climb, atol=1e-4)
         arrow, text = of_ramps([told])
         np.testing.assert_allclose(arrow.points[1] - arrow.points[0], 0.4 * told.climb)

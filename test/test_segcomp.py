@@ -16,6 +16,9 @@ def perceptron_bytes(values):
 
 
 BLANK = np.zeros((2, 2), np.uint8)
+PERCEPTRON = perceptron_bytes(np.zeros((512, 512), np.uint32))
+# Rows and columns of some pixels.
+R, C = np.array([(0, 1), (511, 511), (0, 511), (100, 402), (255, 255)]).T
 
 
 @pytest.mark.parametrize('label', range(13))
@@ -41,9 +44,6 @@ def test_perceptron_values_are_the_lower_12_bits(tmp_path):
     values = np.random.default_rng(1).integers(0, 2**32, (512, 512), np.uint32)
     (tmp_path / 'perc.test.0').write_bytes(perceptron_bytes(values))
     assert np.array_equal(segcomp.read_perceptron(tmp_path / 'perc.test.0'), values & 4095)
-
-
-PERCEPTRON = perceptron_bytes(np.zeros((512, 512), np.uint32))
 
 
 @pytest.mark.parametrize(
@@ -81,10 +81,6 @@ def test_malformed_files(tmp_path, read, data, fault):
     with pytest.raises(SegcompError, match=fault) as error:
         read(path)
     assert str(path) in str(error.value) and '\n' not in str(error.value)
-
-
-# Rows and columns of some pixels.
-R, C = np.array([(0, 1), (511, 511), (0, 511), (100, 402), (255, 255)]).T
 
 
 @pytest.mark.parametrize(
