@@ -3,7 +3,6 @@
 import importlib
 import re
 import sys
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -24,6 +23,7 @@ from rangeseg_ros.segcomp import abw_calibration
 
 ROOT = Path(__file__).parents[1]
 CAMERA = Camera(96, 72, 90.0, 90.0, 47.5, 35.5)
+BY_NORMALS = '--method', 'normals', '--jobs', 1, '--tolerance', '0.8'
 # Two walls that meet in the vertical line x = 0, z = 2.
 LEFT = np.array([np.sqrt(0.5), 0.0, -np.sqrt(0.5), 2 * np.sqrt(0.5)])
 RIGHT = np.array([-np.sqrt(0.5), 0.0, -np.sqrt(0.5), 2 * np.sqrt(0.5)])
@@ -71,15 +71,11 @@ def simulated(tmp_path):
     return folder
 
 
-@pytest.fixture
-def evaluate(figures_of):
-    """Run `rangeseg evaluate`; exit code, figures (or None), standard output and error."""
-    return partial(figures_of, 'evaluate', '--method', 'normals', '--jobs', '1')
-
-
-def test_depth_images_with_known_planes(simulated, evaluate, tmp_path):
+def test_depth_images_with_known_planes(simulated, figures_of, tmp_path):
     output = tmp_path / 'out'
-    code, figures, out, _ = evaluate(simulated, '--tolerance', '0.8', '0.9', '--output', output)
+    code, figures, out, _ = figures_of(
+        'evaluate', simulated, *BY_NORMALS, '0.9', '--output', output
+    )
     assert code == 0
     assert list(figures['per_image']) == ['000002', '000010']
     row = figures['tolerances']['0.8']
@@ -125,9 +121,9 @@ def test_annotated_folders(tmp_path):
     np.testing.assert_array_equal(sample.truth.labels, np.where(truth == 65535, 0, truth))
 
 
-def test_segcomp_set(tmp_path, evaluate):
+def test_segcomp_set(tmp_path, figures_of):
     folder = segcomp_set(tmp_path / 'abw')
-    code, figures, _, _ = evaluate(folder, '--tolerance', '0.8')
+    code, figures, _, _ = figures_of('evaluate', folder, *BY_NORMALS)
     assert code == 0 and list(figures['per_image']) == ['abw.test.1']
     row = figures['tolerances']['0.8']
     assert (row['regions'], row['correct']) == (2, 2)

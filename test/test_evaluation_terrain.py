@@ -5,8 +5,6 @@ what is found of them, away from where they end, is plain. The truth is drawn by
 purpose: what is found as one class counts as an error of another.
 """
 
-from functools import partial
-
 import cv2
 import numpy as np
 import pytest
@@ -34,6 +32,7 @@ DRAWN = (
     (np.s_[30:40, 110:130], DROP),  # of the pit
     (np.s_[40:50, 110:130], GROUND),  # of the pit, 3 m away
 )
+EVALUATE = 'evaluate', '--jobs', 1
 HEADS = 'name kind sensor up_x up_y up_z sensor_height direction count rise run'
 # Where the rays cross the ground, metres; 2 elsewhere.
 CROSSING = (
@@ -82,18 +81,12 @@ def drawn(tmp_path):
     return folder
 
 
-@pytest.fixture
-def evaluate(figures_of):
-    """Run `rangeseg evaluate`; exit code, figures (or None), standard output and error."""
-    return partial(figures_of, 'evaluate', '--jobs', 1)
-
-
-def test_shares_are_those_counted_on_paper(drawn, evaluate):
+def test_shares_are_those_counted_on_paper(drawn, figures_of):
     """Beside borders of classes 3 pixels do not count, nor what is beyond a sensor's reach.
 
     That is told by its own distance, for a drop by that of the ground in its place.
     """
-    code, figures, out, _ = evaluate(drawn)
+    code, figures, out, _ = figures_of(*EVALUATE, drawn)
     assert code == 0 and figures['images'] == 2
     assert figures['by_kind'] == {'far': pytest.approx(REALSENSE), 'near': pytest.approx(KINECT)}
     assert figures['pooled'] == pytest.approx(POOLED)
@@ -109,11 +102,11 @@ def test_shares_are_those_counted_on_paper(drawn, evaluate):
     assert rows['0.4'] == ['-', '1.0000', '-', '-']
 
 
-def test_the_height_in_the_table_is_told_unless_it_shall_not_be(drawn, evaluate):
+def test_the_height_in_the_table_is_told_unless_it_shall_not_be(drawn, figures_of):
     """Nothing is ground where a height of 2.2 m contradicts the floor that is seen 2 m below."""
     change(drawn, '-1,2,', '-1,2.2,')
-    assert evaluate(drawn)[1]['by_kind']['near']['ground_kept'] == 0
-    assert evaluate(drawn, '--unknown-height')[1]['pooled'] == pytest.approx(POOLED)
+    assert figures_of(*EVALUATE, drawn)[1]['by_kind']['near']['ground_kept'] == 0
+    assert figures_of(*EVALUATE, drawn, '--unknown-height')[1]['pooled'] == pytest.approx(POOLED)
 
 
 @pytest.mark.parametrize(
@@ -130,7 +123,7 @@ def test_the_height_in_the_table_is_told_unless_it_shall_not_be(drawn, evaluate)
 )
 def test_errors_are_one_line(drawn, refused, damage, says):
     damage(drawn)
-    assert says in refused('evaluate', drawn, '--jobs', 1)
+    assert says in refused(*EVALUATE, drawn)
 
 
 def change(folder, old, new):
@@ -139,8 +132,8 @@ def change(folder, old, new):
     path.write_text(path.read_text().replace(old, new))
 
 
-def test_pictures_show_truth_what_was_found_and_where_they_differ(drawn, evaluate, tmp_path):
-    assert evaluate(drawn, '--output', tmp_path / 'pictures')[0] == 0
+def test_pictures_show_truth_what_was_found_and_where_they_differ(drawn, figures_of, tmp_path):
+    assert figures_of(*EVALUATE, drawn, '--output', tmp_path / 'pictures')[0] == 0
     picture = cv2.imread(str(tmp_path / 'pictures' / 'kinect_near.png'))[..., ::-1]
     true, found, wrong = np.split(picture, 3, axis=1)
     black, green, red, blue = (0, 0, 0), (0, 150, 0), (220, 0, 0), (0, 0, 240)
@@ -160,12 +153,12 @@ def test_lower_bounds_are_those_of_the_beta_distribution():
         assert lower_bound(successes, trials) == pytest.approx(expected, abs=1e-9)
 
 
-def test_pieces_are_detected_by_size_and_distance(run, evaluate, tmp_path):
+def test_pieces_are_detected_by_size_and_distance(run, figures_of, tmp_path):
     """Without noise: all of 20 cm and more, and nothing dangerous is ground."""
     folder, size = tmp_path / 'set', ('--width', 160, '--height', 120)
     words = 'simulate', 'testpieces', '--sensor', 'ideal', '--scenes', 1, *size
     assert run(*words, '--output', folder)[0] == 0
-    code, figures, out, _ = evaluate(folder)
+    code, figures, out, _ = figures_of(*EVALUATE, folder)
     rows = figures['detection']
     assert {size for kind, size, _ in all_pieces() if kind == 'ramp'} == {5, 10, 15, 20}
     assert code == 0 and 'test pieces detected' in out

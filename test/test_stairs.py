@@ -1,12 +1,12 @@
 """Stairs as objects: edge, count, rise and run against simulated truth; the camera's tilt."""
 
-import csv
 import pickle
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from pytest import approx
+from replays import rows_of
 from scipy.spatial.transform import Rotation
 from terrain_scenes import FLOOR, scene
 
@@ -60,8 +60,7 @@ def test_edge_count_rise_and_run(direction, begin, count, rise, run, tmp_path):
     assert np.abs(edge[:, 2]).max() < 0.03
     # It is written as the contract says, and survives another process.
     path = write_frame(tmp_path, 'a', image, pickle.loads(pickle.dumps(result)), ['stairs'])
-    with path['stairs'].open(newline='') as file:
-        (row,) = csv.DictReader(file)
+    (row,) = rows_of(path['stairs'])
     assert list(row)[:7] == [*(f'edge_{a}{k}' for k in (1, 2) for a in 'xyz'), 'width']
     assert row['direction'] == direction and int(row['count']) == stairs.count
     assert float(row['edge_x1']) == approx(stairs.edge[0, 0], abs=1e-6)
