@@ -3,10 +3,14 @@
 import cv2
 import numpy as np
 
+from rangeseg_ros import RangeImage
 from rangeseg_ros.core.ground.cells import DROP, GROUND
 from rangeseg_ros.simulation.scenes import Pose
+from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
+from rangeseg_ros.simulation.terrain.frame import simulate_terrain
 from rangeseg_ros.simulation.terrain.scene import ALL, FAR, Piece, Terrain, slab
 
+CAMERA, KINECT = kinect_camera(320, 240), Kinect()
 HEIGHT = 1.0
 FLOOR = slab(-3, FAR, 0, 0, ALL)
 
@@ -20,6 +24,17 @@ def drop_of(depth, edge=1.7):
         Piece(slab(-3, edge, 0, 0, ALL), GROUND),
         Piece(slab(edge, FAR, -depth, -depth, ALL), DROP, depth),
     )
+
+
+def view(terrain, camera=CAMERA, seed=0, sensor=KINECT):
+    """Image of a scene, and the truth."""
+    frame = simulate_terrain(terrain, sensor, camera, seed)
+    return RangeImage.from_depth(frame.depth, camera), frame
+
+
+def stated(up):
+    """The parameters that state a direction."""
+    return dict(zip(('up_x', 'up_y', 'up_z'), map(float, up), strict=True))
 
 
 def share(classes, frame, true, called):

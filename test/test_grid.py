@@ -4,22 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from terrain_scenes import drop_of, scene
+from terrain_scenes import drop_of, scene, stated, view
 
-from rangeseg_ros import Config, RangeImage
+from rangeseg_ros import Config
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.ground.grid import GroundMemory
 from rangeseg_ros.core.ground.points import thinned
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.scenes import Pose
-from rangeseg_ros.simulation.sensors.kinect import Kinect
-from rangeseg_ros.simulation.sensors.sensor import resize
 from rangeseg_ros.simulation.solids import box
-from rangeseg_ros.simulation.terrain.frame import simulate_terrain
 from rangeseg_ros.simulation.terrain.scene import Piece
 
-CAMERA = resize(Kinect().camera, 320, 240)
 HEIGHT, EDGE = 0.8, 2.0
 GROUND_IN_MAP = 0.3
 FLOOR, LANDING = drop_of(0.15, EDGE)
@@ -31,18 +27,15 @@ class Drive:
 
     def __init__(self, posed=True, **parameters):
         self.pose = Pose.looking((0, 0, HEIGHT), 0, 30, 0)
-        up = dict(zip(('up_x', 'up_y', 'up_z'), map(float, self.pose.rotation[2]), strict=True))
-        fixed = 'map' if posed else ''
+        up, fixed = stated(self.pose.rotation[2]), 'map' if posed else ''
         config = Config(**up, fixed_frame=fixed, sensor_height=HEIGHT, **parameters)
         self.sequence = SequenceSegmenter(config)
 
     def grid(self, x, second, pieces=(FLOOR, LANDING, BOX)):
         pose = replace(self.pose, position=np.array([x, 0, HEIGHT]))
-        terrain = replace(scene(*pieces), pose=pose)
-        frame = simulate_terrain(terrain, Kinect(), CAMERA, seed=int(second))
+        image, _ = view(replace(scene(*pieces), pose=pose), seed=int(second))
         told = Transform(pose.rotation, np.add(pose.position, (0, 0, GROUND_IN_MAP)))
         at = told if self.sequence.config.map_frame else None
-        image = RangeImage.from_depth(frame.depth, CAMERA)
         return self.sequence.segment(image, int(1e9 * second), pose=at).grid
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import norm
-from terrain_scenes import FLOOR, drop_of, scene, share
+from terrain_scenes import FLOOR, KINECT, drop_of, scene, share, view
 
 from rangeseg_ros import Camera, Config, RangeImage
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE
@@ -12,18 +12,16 @@ from rangeseg_ros.core.ground.terrain import terrain_of
 from rangeseg_ros.core.segmentation import STATED
 from rangeseg_ros.simulation.sensors.kinect import Kinect
 from rangeseg_ros.simulation.solids import box, prism
-from rangeseg_ros.simulation.terrain.frame import simulate_terrain
 from rangeseg_ros.simulation.terrain.scene import ALL, FAR, Piece, slab
 
-SEEN = np.degrees(np.arctan2(240, Kinect(0).camera.fy))  # below the middle of the image
+SEEN = np.degrees(np.arctan2(240, KINECT.camera.fy))  # below the middle of the image
 ABOVE = 0.8
 
 
 def judged(pieces, pitch, height, seed=0, camera=ABOVE, yaw=0, config=None):
     """Terrain as the camera's true up has it, and the truth."""
     terrain = scene(*pieces, pitch=pitch, yaw=yaw, height=camera)
-    frame = simulate_terrain(terrain, Kinect(seed), seed=seed)
-    image = RangeImage.from_depth(frame.depth, Kinect(seed).camera)
+    image, frame = view(terrain, KINECT.camera, seed, Kinect(seed))
     known = (height, 0.015) if height else (0.0, 0.0)
     return terrain_of(image, STATED, terrain.up, known, config or Config()), frame
 

@@ -8,19 +8,16 @@ import pytest
 from pytest import approx
 from replays import rows_of
 from scipy.spatial.transform import Rotation
-from terrain_scenes import FLOOR, scene
+from terrain_scenes import CAMERA, FLOOR, scene, stated, view
 
 from rangeseg_ros import Config, RangeImage, Segmenter
 from rangeseg_ros.batch.frame_files import write_frame
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE
 from rangeseg_ros.evaluation.stairs import StairsCheck, check_stairs, stairs_figures, stairs_line
-from rangeseg_ros.simulation.sensors.kinect import Kinect
-from rangeseg_ros.simulation.sensors.sensor import resize
 from rangeseg_ros.simulation.solids import box
-from rangeseg_ros.simulation.terrain.frame import simulate_terrain
 from rangeseg_ros.simulation.terrain.scene import ALL, Piece, slab
 
-CAMERA, SIDES = resize(Kinect().camera, 320, 240), (-0.5, 0.6)
+SIDES = -0.5, 0.6
 
 
 def treads(edge, rise, run, class_, sides):
@@ -31,14 +28,10 @@ def treads(edge, rise, run, class_, sides):
         yield Piece(slab(begin, end, level, level, y), class_, abs(level))
 
 
-def up_of(up):
-    return dict(zip(('up_x', 'up_y', 'up_z'), map(float, up), strict=True))
-
-
 def seen(*pieces, yaw=0):
     terrain = scene(*pieces, pitch=35, roll=2, yaw=yaw, height=1.5)
-    image = RangeImage.from_depth(simulate_terrain(terrain, Kinect(), CAMERA).depth, CAMERA)
-    config = Config(**up_of(terrain.up), sensor_height=1.5)
+    image, _ = view(terrain)
+    config = Config(**stated(terrain.up), sensor_height=1.5)
     return terrain, image, Segmenter(config).segment(image)
 
 
@@ -72,7 +65,7 @@ def test_the_edge_is_in_the_frame_of_a_cloud():
     )
     turn, place = Rotation.from_rotvec((1.3, -0.7, 2.1)).as_matrix(), np.array([0.3, 0.2, 0.8])
     cloud = RangeImage.from_points((image.points @ turn.T + place).astype(np.float32))
-    config = Config(**up_of(turn @ terrain.up), sensor_height=1.5)
+    config = Config(**stated(turn @ terrain.up), sensor_height=1.5)
     (expected,), (stairs,) = result.stairs, Segmenter(config).segment(cloud).stairs
     ends = expected.edge @ turn.T + place
     # Which end is the first one depends on the axes.
@@ -106,11 +99,10 @@ def test_a_tilted_camera_is_noticed_and_said(axis, segment_image):
     terrain, image, straight = seen(Piece(FLOOR, GROUND), wall)
     assert straight.tilt is None
     wrong = Rotation.from_rotvec(np.radians(20) * np.array(axis)).apply(terrain.up)
-    tilt = Segmenter(Config(**up_of(wrong))).segment(image).tilt
+    tilt = Segmenter(Config(**stated(wrong))).segment(image).tilt
     assert tilt.degrees == approx(np.degrees(np.arccos(wrong @ terrain.up)), abs=2)
     assert tilt.up == approx(terrain.up, abs=0.03)
-    depth = simulate_terrain(terrain, Kinect(), CAMERA).depth
-    code, _, error = segment_image(depth, CAMERA, **up_of(wrong))
+    code, _, error = segment_image(view(terrain)[1].depth, CAMERA, **stated(wrong))
     assert code == 0 and 'up as stated, or of a level camera, is off by' in error
 
 

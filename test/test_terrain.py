@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from clouds import cloud_of
 from scipy.spatial.transform import Rotation
-from terrain_scenes import FLOOR, HEIGHT, drop_of, scene, share
+from terrain_scenes import CAMERA, FLOOR, HEIGHT, KINECT, drop_of, scene, share, stated, view
 
 from rangeseg_ros import Config, RangeImage, Segmenter
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN, cells_of
@@ -14,27 +14,18 @@ from rangeseg_ros.core.ground.points import drops, outlines, unseen
 from rangeseg_ros.core.ground.reach import reach
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import SequenceSegmenter, with_roles
-from rangeseg_ros.simulation.sensors.kinect import Kinect
-from rangeseg_ros.simulation.sensors.sensor import Ideal, resize
+from rangeseg_ros.simulation.sensors.sensor import Ideal
 from rangeseg_ros.simulation.solids import box
+from rangeseg_ros.simulation.terrain import kinds
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
-from rangeseg_ros.simulation.terrain.kinds import stated, terrain_scene
 from rangeseg_ros.simulation.terrain.scene import ALL, FAR, Piece, slab
-
-CAMERA = resize(Kinect().camera, 320, 240)
-
-
-def stated_to_be(up, height, **parameters):
-    directions = dict(zip(('up_x', 'up_y', 'up_z'), map(float, up), strict=True))
-    return Config(**directions, sensor_height=height, **parameters)
 
 
 def found(terrain, height=HEIGHT, **parameters):
     """What is found of a scene with an up that is 1 degree per axis off, and the truth."""
     up = Rotation.from_euler('xyz', [1, -1, 1], degrees=True).apply(terrain.up)
-    frame = simulate_terrain(terrain, Kinect(), CAMERA)
-    image = RangeImage.from_depth(frame.depth, CAMERA)
-    config = stated_to_be(up, height, **parameters)
+    image, frame = view(terrain)
+    config = Config(**stated(up), sensor_height=height, **parameters)
     return image, Segmenter(config).segment(image), frame
 
 
@@ -91,10 +82,10 @@ def test_a_whole_object_is_an_obstacle_and_has_its_height():
     ],
 )
 def test_what_is_beside_a_curb_or_bridge_is_told_from_it_as_a_whole(kind, seed, class_):
-    terrain, sensor = terrain_scene(kind, seed), Kinect()
-    frame = simulate_terrain(terrain, sensor, seed=seed)
-    config = stated_to_be(*stated(terrain, seed))
-    result = Segmenter(config).segment(RangeImage.from_depth(frame.depth, sensor.camera))
+    terrain = kinds.terrain_scene(kind, seed)
+    image, frame = view(terrain, KINECT.camera, seed)
+    up, height = kinds.stated(terrain, seed)
+    result = Segmenter(Config(**stated(up), sensor_height=height)).segment(image)
     assert share(result.terrain, frame, class_, class_) > 0.95
     assert share(result.terrain, frame, class_, GROUND) < 0.01
     assert share(result.terrain, frame, GROUND, GROUND) > 0.98
@@ -193,8 +184,7 @@ def test_what_was_the_ground_stays_it_while_it_is_out_of_view():
         'wall': scene(wall, floor, pitch=0),
         'landing': scene(landing, pitch=35),
     }
-    depth = {name: simulate_terrain(view, Kinect(), CAMERA).depth for name, view in views.items()}
-    images = {name: RangeImage.from_depth(seen, CAMERA) for name, seen in depth.items()}
+    images = {name: view(terrain)[0] for name, terrain in views.items()}
     sequence = SequenceSegmenter(Config())
 
     def ground_at(name, second):
