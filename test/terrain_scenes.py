@@ -26,6 +26,14 @@ def drop_of(depth, edge=1.7):
     )
 
 
+def gap(begin, end, depth, seen='surface'):
+    return (
+        Piece(slab(-3, begin, 0, 0, ALL), GROUND),
+        Piece(slab(begin, end, -depth, -depth, ALL), DROP, depth, seen),
+        Piece(slab(end, FAR, 0, 0, ALL), GROUND),
+    )
+
+
 def view(terrain, camera=CAMERA, seed=0, sensor=KINECT):
     """Image of a scene, and the truth."""
     frame = simulate_terrain(terrain, sensor, camera, seed)

@@ -81,12 +81,12 @@ def drawn(tmp_path):
     return folder
 
 
-def test_shares_are_those_counted_on_paper(drawn, figures_of):
+def test_shares_and_pictures_are_those_counted_on_paper(drawn, figures_of, tmp_path):
     """Beside borders of classes 3 pixels do not count, nor what is beyond a sensor's reach.
 
     That is told by its own distance, for a drop by that of the ground in its place.
     """
-    code, figures, out, _ = figures_of(*EVALUATE, drawn)
+    code, figures, out, _ = figures_of(*EVALUATE, drawn, '--output', tmp_path / 'pictures')
     assert code == 0 and figures['images'] == 2
     assert figures['by_kind'] == {'far': pytest.approx(REALSENSE), 'near': pytest.approx(KINECT)}
     assert figures['pooled'] == pytest.approx(POOLED)
@@ -100,6 +100,17 @@ def test_shares_are_those_counted_on_paper(drawn, figures_of):
     for kind, expected in (('near', KINECT), ('far', REALSENSE), ('all', POOLED)):
         assert rows[kind] == [f'{value:.4f}' for value in expected.values()]
     assert rows['0.4'] == ['-', '1.0000', '-', '-']
+    # Truth, what was found, and where they differ.
+    picture = cv2.imread(str(tmp_path / 'pictures' / 'kinect_near.png'))[..., ::-1]
+    black, green, red, blue = (0, 0, 0), (0, 150, 0), (220, 0, 0), (0, 0, 240)
+    for (row, column), colours in (
+        ((90, 30), (green, green, black)),  # kept
+        ((85, 65), (red, green, green)),  # an obstacle called ground
+        ((40, 45), (green, red, red)),  # ground called an obstacle
+        ((31, 120), (blue, blue, black)),  # a drop that is found
+        ((85, 125), (blue, green, black)),  # out of reach
+    ):
+        assert np.array_equal(picture[row, column :: CAMERA.width], colours)
 
 
 def test_the_height_in_the_table_is_told_unless_it_shall_not_be(drawn, figures_of):
@@ -130,21 +141,6 @@ def change(folder, old, new):
     path = folder / 'terrain.csv'
     assert old in path.read_text()
     path.write_text(path.read_text().replace(old, new))
-
-
-def test_pictures_show_truth_what_was_found_and_where_they_differ(drawn, figures_of, tmp_path):
-    assert figures_of(*EVALUATE, drawn, '--output', tmp_path / 'pictures')[0] == 0
-    picture = cv2.imread(str(tmp_path / 'pictures' / 'kinect_near.png'))[..., ::-1]
-    true, found, wrong = np.split(picture, 3, axis=1)
-    black, green, red, blue = (0, 0, 0), (0, 150, 0), (220, 0, 0), (0, 0, 240)
-    for place, colours in (
-        ((90, 30), (green, green, black)),  # kept
-        ((85, 65), (red, green, green)),  # an obstacle called ground
-        ((40, 45), (green, red, red)),  # ground called an obstacle
-        ((31, 120), (blue, blue, black)),  # a drop that is found
-        ((85, 125), (blue, green, black)),  # out of reach
-    ):
-        assert [tuple(part[place]) for part in (true, found, wrong)] == list(colours)
 
 
 def test_lower_bounds_are_those_of_the_beta_distribution():

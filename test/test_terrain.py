@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from clouds import cloud_of
 from scipy.spatial.transform import Rotation
-from terrain_scenes import CAMERA, FLOOR, HEIGHT, KINECT, drop_of, scene, share, stated, view
+from terrain_scenes import CAMERA, FLOOR, HEIGHT, KINECT, drop_of, gap, scene, share, stated, view
 
 from rangeseg_ros import Config, RangeImage, Segmenter
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN, cells_of
@@ -19,6 +19,8 @@ from rangeseg_ros.simulation.solids import box
 from rangeseg_ros.simulation.terrain import kinds
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
 from rangeseg_ros.simulation.terrain.scene import ALL, FAR, Piece, slab
+
+PIT = 0.1, 'nothing'  # deep, of which nothing is measured
 
 
 def found(terrain, height=HEIGHT, **parameters):
@@ -119,20 +121,11 @@ def test_ramps_are_ground_as_long_as_they_are_not_steep(degrees, missed):
     assert (steeper.terrain == GROUND).sum() > 0.97 * (frame.depth > 0).sum()
 
 
-def pit(begin, end):
-    """Ten centimetres deep, of which nothing is measured."""
-    return (
-        Piece(slab(-3, begin, 0, 0, ALL), GROUND),
-        Piece(slab(end, FAR, 0, 0, ALL), GROUND),
-        Piece(slab(begin, end, -0.1, -0.1, ALL), DROP, 0.1, 'nothing'),
-    )
-
-
 @pytest.mark.parametrize('find', [drops, unseen])
 @pytest.mark.parametrize('edge', [1.7, 3.0])
 def test_crossings_leave_no_cell_of_a_costmap_free_beyond_an_edge(edge, find):
     """Cells of 5 cm, as far away as drops must be found; one more or less along the view."""
-    terrain = scene(*(drop_of(0.3, edge) if find is drops else pit(edge, edge + 0.9)))
+    terrain = scene(*(drop_of(0.3, edge) if find is drops else gap(edge, edge + 0.9, *PIT)))
     image, result, frame = found(terrain)
     points = find(image, result.ground)
     world = in_the_world(points[:, :3], terrain)
@@ -151,7 +144,7 @@ def test_crossings_leave_no_cell_of_a_costmap_free_beyond_an_edge(edge, find):
 
 def test_a_pit_is_unseen_in_a_cloud_as_well_and_outlined():
     """A cloud does not say where it looked: what it saw around tells."""
-    terrain, count = scene(*pit(1.5, 2.2)), []
+    terrain, count = scene(*gap(1.5, 2.2, *PIT)), []
     image, result, _ = found(terrain)
     cloud = cloud_of(image.points)
     for seen, of_it in ((image, result), (cloud, Segmenter(result.survey.config).segment(cloud))):
