@@ -94,10 +94,9 @@ def test_depth_images_with_known_planes(simulated, figures_of, tmp_path):
 
 def test_picture_colours(simulated):
     sample = find_cases(simulated)[0].load()
-    labels = np.zeros(sample.image.shape, np.uint16)
     # Region 1 in two halves: over-segmented; region 2 missed, but for a speck of noise.
-    labels[sample.truth.labels == 1] = 1
-    labels[36:][labels[36:] == 1] = 2
+    halves = np.repeat([1, 2], 36)[:, None]
+    labels = np.where(sample.truth.labels == 1, halves, 0).astype(np.uint16)
     labels[50:54, 80:84] = 3
     overlap = sample.truth.compare(labels)
     picture = class_picture(sample, labels, overlap, classify(overlap, 0.8))

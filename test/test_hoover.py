@@ -76,12 +76,9 @@ def test_overlap_figures_by_hand():
     # Truth 3 (5): untouched, IoU 0. Mean of the best: (2/3 + 2/3 + 0) / 3.
     # One to one: 1-1 (8) and 2-3 (4): 12 of 21 pixels. No IoU reaches 0.8.
     item = overlap((1, 1, 8), (0, 1, 2), (1, 2, 2), (2, 2, 2), (2, 3, 4), (3, 0, 5))
-    figures = overlap_figures([item])
-    assert figures['mean_iou'] == pytest.approx(4 / 9)
-    assert figures['pixel_accuracy'] == pytest.approx(12 / 21)
-    assert figures['precision'] == figures['recall'] == 0
-    figures = overlap_figures([item], threshold=0.6)
-    assert figures['precision'] == figures['recall'] == pytest.approx(2 / 3)
+    for figures, found in (overlap_figures([item]), 0), (overlap_figures([item], 0.6), 2 / 3):
+        expected = {'mean_iou': 4 / 9, 'pixel_accuracy': 12 / 21}
+        assert figures == pytest.approx({**expected, 'precision': found, 'recall': found})
 
 
 def test_figures_are_of_the_best_assignment_and_pooled_over_images():
@@ -98,12 +95,10 @@ def test_figures_are_of_the_best_assignment_and_pooled_over_images():
 def test_angle_errors_of_correct_pairs():
     normals = {5: (0, 0, -1), 6: (0, -1, 0), 7: (0, np.sin(0.1), -np.cos(0.1))}
     matches = {10: 5, 11: 6, 12: 7}
-    # 5-6 is 90 degrees; 5-7 is 0.1 rad; 13 has no match.
-    angles = [(10, 11, 88.0), (10, 12, 0.0), (11, 13, 45.0)]
-    assert angle_errors(angles, normals, matches) == pytest.approx([2.0, np.degrees(0.1)])
-    # 174 degrees and 6 degrees are one angle between planes.
-    acute = angle_errors([(10, 12, 174.0)], normals, matches)
-    assert acute == pytest.approx([6 - np.degrees(0.1)])
+    # 5-6 is 90 degrees; 5-7 is 0.1 rad; 13 has no match. 174 degrees and 6 degrees are one angle
+    # between planes.
+    angles, off = [(10, 11, 88.0), (10, 12, 0.0), (11, 13, 45.0), (10, 12, 174.0)], np.degrees(0.1)
+    assert angle_errors(angles, normals, matches) == pytest.approx([2.0, off, 6 - off])
     assert angle_errors([], normals, matches).shape == (0,)
 
 

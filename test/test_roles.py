@@ -58,9 +58,8 @@ def test_parts_of_the_floor_steps_and_what_lies_beneath_it():
         for k, height in enumerate((1.11, 1.09, 0.93, 1.29, 1.31))
     )
     found = planes(((slice(106, 120), ALL), UP, 1.2), *scraps)
-    apart = [replace(plane, surface=plane.label) for plane in found]
-    together = [replace(plane, surface=1) for plane in found]
-    for found in (apart, together):
+    for surfaces in (range(6), 6 * [1]):
+        found = [replace(plane, surface=k) for plane, k in zip(found, surfaces, strict=True)]
         assert roles(found, LEVEL) == ['floor', 'floor', 'step', 'table', 'floor', 'lower']
     assert roles(found, Config(role_height=0.0905))[1:3] == ['floor', 'step']
     assert roles(found, Config(role_height=0.12))[1:3] == ['floor'] * 2
