@@ -60,9 +60,8 @@ def test_edge_count_rise_and_run(direction, begin, count, rise, run, tmp_path):
 
 
 def test_the_edge_is_in_the_frame_of_a_cloud():
-    terrain, image, result = seen(
-        Piece(FLOOR, GROUND), *treads(1.9, 0.17, 0.28, OBSTACLE, 3 * [SIDES])
-    )
+    steps = treads(1.9, 0.17, 0.28, OBSTACLE, 3 * [SIDES])
+    terrain, image, result = seen(Piece(FLOOR, GROUND), *steps)
     turn, place = Rotation.from_rotvec((1.3, -0.7, 2.1)).as_matrix(), np.array([0.3, 0.2, 0.8])
     cloud = RangeImage.from_points((image.points @ turn.T + place).astype(np.float32))
     config = Config(**stated(turn @ terrain.up), sensor_height=1.5)
