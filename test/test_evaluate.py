@@ -235,9 +235,8 @@ HALF = [7] * 8 + [8] * 4 + [0] * 3
         ('0.8', [0, 0], [0, 0], 1, {'mean_iou': None}),
     ],
 )
-def test_what_is_not_judged_or_too_small_does_not_count(
-    tmp_path, figures_of, tolerance, truth, labels, least, expected
-):
+def test_two_images_by_hand(tmp_path, figures_of, tolerance, truth, labels, least, expected):
+    """What is not judged, or too small, does not count."""
     truth, labels = (write(tmp_path / f'{k}.png', [row]) for k, row in enumerate((truth, labels)))
     _, figures, *_ = figures_of('compare', truth, labels, '--min-pixels', least)
     row = figures['tolerances'][tolerance]
@@ -266,8 +265,7 @@ def test_tables_and_plots(tmp_path, monkeypatch, name, count):
     words = [name, folder, '--output', tmp_path / 'out', '--jobs', 1]
     monkeypatch.setattr(sys, 'argv', ['experiments.py', *map(str, words)])
     experiments.main()
-    rows = (tmp_path / f'out/{name}.csv').read_text().splitlines()
-    assert len(rows) == 1 + count
+    assert len((tmp_path / f'out/{name}.csv').read_text().splitlines()) == 1 + count
     assert (tmp_path / f'out/{name}.png').stat().st_size > 10_000
 
 

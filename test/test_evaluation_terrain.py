@@ -34,18 +34,11 @@ DRAWN = (
 )
 EVALUATE = 'evaluate', '--jobs', 1
 HEADS = 'name kind sensor up_x up_y up_z sensor_height direction count rise run'
-# Where the rays cross the ground, metres; 2 elsewhere.
-CROSSING = (
-    (np.s_[80:90, 110:120], 3.0),  # 100 of the drop that is floor
-    (np.s_[80:90, 120:130], 3.6),  # 100 of them
-)
 NO_CLASS, FLAT = np.full(CAMERA.shape, 4, np.uint8), np.ones(CAMERA.shape, np.float32)
 # Reaches of 3.5 and of 2.5 m: pixels by true and found class, as the comments above add up.
 SENSORS = {'kinect': 'near', 'realsense': 'far'}
 SHARES = [f'ground_{name}' for name in ('kept', 'called_obstacle', 'called_drop')]
-SHARES += [
-    f'{name}_{what}' for name in ('obstacle', 'drop') for what in ('found', 'called_ground')
-]
+SHARES += [f'{name}_{how}' for name in ('obstacle', 'drop') for how in ('found', 'called_ground')]
 KINECT, REALSENSE, POOLED = (
     dict(zip(SHARES, values, strict=True))
     for values in (
@@ -66,8 +59,8 @@ def drawn(tmp_path):
     for where, class_ in DRAWN:
         truth[where] = class_
     crossing, size = np.full((2, *CAMERA.shape), 2.0, np.float32)
-    for where, metres in CROSSING:
-        crossing[where] = metres
+    # Where the rays cross the ground, metres: 100 pixels each of the drop that is floor.
+    crossing[80:90, 110:120], crossing[80:90, 120:130] = 3.0, 3.6
     size[:], size[BOX] = 0.05, 0.4
     height = (2 - depth / 1000).astype(np.float32)
     images = {'depth': depth, 'truth': truth, 'crossing': crossing, 'size': size, 'height': height}

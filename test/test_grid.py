@@ -16,8 +16,7 @@ from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.solids import box
 from rangeseg_ros.simulation.terrain.scene import Piece
 
-HEIGHT, EDGE = 0.8, 2.0
-GROUND_IN_MAP = 0.3
+HEIGHT, EDGE, GROUND_IN_MAP = 0.8, 2.0, 0.3
 FLOOR, LANDING = drop_of(0.15, EDGE)
 BOX = Piece(box((0.2, 0.2, 0.3), np.eye(3), (1.4, 0.3, 0.15)), OBSTACLE, 0.3)
 

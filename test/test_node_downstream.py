@@ -20,8 +20,7 @@ from rangeseg_ros.ros.locator import TIME_CONSTANT, Reading
 
 pytestmark = pytest.mark.ros
 
-HEIGHT, WALL = 0.8, 3.0
-GRAVITY = 9.81
+HEIGHT, WALL, GRAVITY = 0.8, 3.0, 9.81
 node, bench = benches('labels', 'planes')
 
 

@@ -91,10 +91,9 @@ def test_planes_of_another_frame_are_the_same_planes():
 
 @pytest.mark.parametrize(('parameter', 'expected'), [(0.0, 1.0), (0.9, 0.9)])
 def test_the_height_counts_where_the_parameter_does_not(parameter, expected):
-    sequence = SequenceSegmenter(Config(sensor_height=parameter))
     image = RangeImage.from_depth(np.ones(CAMERA.shape, np.float32), CAMERA)
-    result = sequence.segment(image, 10**9, UP, height=1.0)
-    assert result.survey.sensor_height == expected
+    sequence = SequenceSegmenter(Config(sensor_height=parameter))
+    assert sequence.segment(image, 0, UP, height=1.0).survey.sensor_height == expected
 
 
 def test_the_last_up_is_held_while_a_slope_can_be_told_from_level_ground():
