@@ -48,11 +48,9 @@ def segcomp_set(folder):
     """One ABW test image of the corner, 1.1 times nearer, with its truth and its angle."""
     folder.mkdir()
     calibration = abw_calibration(1)
-    rays = calibration.camera.rays.astype(float)
-    depth, truth = corner(rays)
-    values = (500 * depth - calibration.offset) * calibration.scale
-    values = np.rint(values).clip(1, 255).astype(np.uint8)
-    (folder / 'abw.test.1.range').write_bytes(raster(values))
+    depth, truth = corner(calibration.camera.rays.astype(float))
+    values = np.rint((500 * depth - calibration.offset) * calibration.scale).clip(1, 255)
+    (folder / 'abw.test.1.range').write_bytes(raster(values.astype(np.uint8)))
     (folder / 'abw.test.1.gt-seg').write_bytes(raster((truth + 9).astype(np.uint8)))
     (folder / 'abw.test.1.gt-ang').write_text('1\n10 11 90.0\n')
     return folder
@@ -170,18 +168,15 @@ def test_refusals_of_evaluate(simulated, refused, tmp_path):
 
 
 def write(path, labels):
-    image = np.array(labels, np.uint16)
-    if path.suffix == '.png':
-        write_image(path, image)
-    else:
-        path.write_bytes(raster(image.astype(np.uint8)))
+    write_image(path, np.array(labels, np.uint16))
     return path
 
 
 def test_rasters_count_regions_from_ten(tmp_path, figures_of):
     # 0-3 are no regions on either side, so nothing is noise.
-    truth = write(tmp_path / 'abw.test.1.gt-seg', [[10, 10, 2, 3], [11, 11, 0, 1]])
-    labels = write(tmp_path / 'abw.test.1.ms-seg', [[12, 12, 3, 2], [10, 10, 1, 0]])
+    truth, labels = tmp_path / 'abw.test.1.gt-seg', tmp_path / 'abw.test.1.ms-seg'
+    truth.write_bytes(raster(np.array([[10, 10, 2, 3], [11, 11, 0, 1]], np.uint8)))
+    labels.write_bytes(raster(np.array([[12, 12, 3, 2], [10, 10, 1, 0]], np.uint8)))
     _, figures, *_ = figures_of('compare', truth, labels)
     assert list(figures['tolerances']) == ['0.51', '0.6', '0.7', '0.8', '0.9', '0.95']
     row = figures['tolerances']['0.95']

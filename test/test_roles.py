@@ -53,10 +53,8 @@ def test_the_floor_is_the_surface_at_the_stated_height():
 
 
 def test_parts_of_the_floor_steps_and_what_lies_beneath_it():
-    scraps = (
-        ((slice(100, 106), slice(30 * k, 30 * k + 10)), UP, height)
-        for k, height in enumerate((1.11, 1.09, 0.93, 1.29, 1.31))
-    )
+    heights = enumerate((1.11, 1.09, 0.93, 1.29, 1.31))
+    scraps = (((slice(100, 106), slice(30 * k, 30 * k + 10)), UP, h) for k, h in heights)
     found = planes(((slice(106, 120), ALL), UP, 1.2), *scraps)
     for surfaces in (range(6), 6 * [1]):
         found = [replace(plane, surface=k) for plane, k in zip(found, surfaces, strict=True)]

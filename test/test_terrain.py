@@ -61,10 +61,8 @@ def test_a_mirage_in_the_floor_is_a_drop():
 
 
 def test_a_whole_object_is_an_obstacle_and_has_its_height():
-    low, high = (
-        Piece(box(size, np.eye(3), (*place, size[2] / 2)), OBSTACLE, size[2])
-        for size, place in (((0.3, 0.5, 0.08), (1.75, -0.4)), ((0.3, 0.4, 0.4), (1.95, 0.4)))
-    )
+    low = Piece(box((0.3, 0.5, 0.08), np.eye(3), (1.75, -0.4, 0.04)), OBSTACLE, 0.08)
+    high = Piece(box((0.3, 0.4, 0.4), np.eye(3), (1.95, 0.4, 0.2)), OBSTACLE, 0.4)
     _, result, frame = found(scene(low, high, Piece(FLOOR, GROUND)))
     assert share(result.terrain, frame, OBSTACLE, OBSTACLE) > 0.97
     assert share(result.terrain, frame, GROUND, GROUND) > 0.99
