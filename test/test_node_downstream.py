@@ -125,9 +125,8 @@ def test_up_is_that_of_the_accelerometer_in_the_frame_of_the_images(bench):
 
         # Nothing measured yet, then nothing that could be used.
         assert planes_of(bench)['floor']['distance'] == level
-        missing = bench.status(
-            lambda s: 'no acceleration of rest yet' in s.message, lambda: planes_of(bench)
-        )
+        awaited = 'no acceleration of rest yet'
+        missing = bench.status(lambda s: awaited in s.message, lambda: planes_of(bench))
         assert missing.level == DiagnosticStatus.ERROR and 'no terrain' in missing.message
         for fields in ({'frame': 'imu_link'}, {'covariance': -1.0}):
             assert height(0, 0, -GRAVITY, **fields) == level
