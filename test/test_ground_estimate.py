@@ -81,9 +81,9 @@ def test_what_falls_to_the_side_by_20_degrees_is_no_ground(yaw):
     assert yaw or share(terrain.classes, frame, GROUND, GROUND) > 0.97
 
 
-@pytest.mark.parametrize(('width', 'kept'), [(0.15, 0.0), (0.5, 0.97)])
-def test_ground_leads_over_gaps_that_the_robot_crosses(width, kept):
-    config = Config(ground_gap=width, robot_radius=0.6)
+@pytest.mark.parametrize(('most', 'wide', 'kept'), [(0.15, 1, 0), (0.5, 1, 0.97), (0.5, 0.2, 0)])
+def test_ground_leads_over_gaps_that_the_robot_crosses(most, wide, kept):
+    config = Config(ground_gap=most, robot_radius=wide)
     terrain, frame = judged(gap(1.2, 1.5, 1.0), 28, ABOVE, config=config)
     beyond = (frame.terrain == GROUND) & (frame.depth > 2100) & (frame.depth < 2600)
     assert beyond.sum() > 1000
