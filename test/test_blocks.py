@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 
+from rangeseg_ros import Camera, Config, RangeImage
 from rangeseg_ros.core.by_planes.patches import Nodes
-from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.blocks import Blocks
-from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import Grid, View, grid_of
 from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, SIZE, fit_all
-from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
 
@@ -160,12 +158,10 @@ def test_fit_is_weighted_least_squares(seed):
 
 @pytest.mark.parametrize('case', ['nothing', 'two pixels', 'a line'])
 def test_pixels_that_determine_no_plane(case):
-    rays, inverse, weight = pixels(8, 40)
-    if case == 'nothing':
-        rays, inverse, weight = rays[:0], inverse[:0], weight[:0]
-    elif case == 'a line':
+    rays, inverse, weight = pixels(8, 0 if case == 'nothing' else 40)
+    if case == 'a line':
         rays[:, 1] = 0.5 * rays[:, 0] - 0.125
-    else:
+    elif case == 'two pixels':
         rays[:] = rays[np.arange(40) % 2]
     moments = moments_of(rays, inverse, weight)
     theta, chi2 = fit_all(np.stack([moments, moments_of(*pixels(9))]))

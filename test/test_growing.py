@@ -3,16 +3,14 @@
 import numpy as np
 import pytest
 
+from rangeseg_ros import Camera, Config, RangeImage
 from rangeseg_ros.core.by_planes.patches import Nodes, find_patches
 from rangeseg_ros.core.by_planes.region_graph import absorb, find_contacts
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces
-from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.blocks import Blocks
-from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import View, grid_of
 from rangeseg_ros.core.sensing.jump_edges import plane_deviation
 from rangeseg_ros.core.sensing.moments import fit_all
-from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
 CAMERA = Camera(160, 120, 146.0, 146.0, 79.5, 59.5)

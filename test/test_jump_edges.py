@@ -8,10 +8,8 @@ import pytest
 from clouds import cloud_of
 from scipy.ndimage import correlate, maximum_filter, minimum_filter
 
-from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros import Camera, RangeImage, Segmenter
 from rangeseg_ros.core.sensing.bridges import bridge_holes
-from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import grid_of
 from rangeseg_ros.core.sensing.jump_edges import (
     bridge_edges,
@@ -20,7 +18,6 @@ from rangeseg_ros.core.sensing.jump_edges import (
     plane_deviation,
     sobel,
 )
-from rangeseg_ros.core.sensing.range_image import RangeImage
 
 STEP = 0.0044
 CAMERA = Camera(120, 100, 100.0, 100.0, 59.5, 49.5)
@@ -37,9 +34,8 @@ def ramp(a=0.0, b=0.0, c=0.5):
 
 
 def parts(edges):
-    """Number of 4-connected parts that the edges cut the image into."""
-    height, width = edges[1].shape[0] + 1, edges[0].shape[1] + 1
-    grid = np.zeros((2 * height - 1, 2 * width - 1), np.uint8)
+    """The 4-connected parts (H, W) that the edges cut the image into, numbered."""
+    grid = np.zeros(2 * np.array(CAMERA.shape) - 1, np.uint8)
     grid[::2, ::2] = 1
     grid[::2, 1::2] = ~edges[0]
     grid[1::2, ::2] = ~edges[1]
@@ -70,36 +66,40 @@ def test_planes_and_creases_have_no_jump(inverse):
     assert not horizontal.any() and not vertical.any()
 
 
-def test_a_line_between_two_jumps_is_parted_from_both():
+# What is lower than four steps and twice as steep as the surfaces is no jump.
+@pytest.mark.parametrize(('slope', 'jumps'), [(0.0, [69, 70]), (0.041, [69, 70]), (0.042, [70])])
+def test_a_line_between_two_jumps_is_parted_from_both(slope, jumps):
     """A pixel wide, a jump on either side: none continues the other, alike as they are."""
     inverse = np.full(CAMERA.shape, 0.5)
     inverse[:, 70] = 0.6
     inverse[:, 71:] = 0.7 + 3 * STEP
-    horizontal, _ = plane_deviation(image_of(inverse), STEP)
-    assert horizontal[:, 69:71].all() and horizontal.sum() == 2 * CAMERA.height
+    horizontal, _ = plane_deviation(image_of(inverse), STEP, slope)
+    assert horizontal[:, jumps].all() and horizontal.sum() == len(jumps) * CAMERA.height
 
 
-@pytest.mark.parametrize('height', [1.1 * STEP, 0.1, -0.1])
+@pytest.mark.parametrize(('height', 'dark'), [(1.1 * STEP, 0), (0.1, 4), (-0.1, 4)])
 @pytest.mark.parametrize('slope', [(0, 0), (0.001, 0.001)])
-def test_a_jump_lies_exactly_between_its_pixels(height, slope):
+def test_a_jump_lies_exactly_between_its_pixels(height, dark, slope):
+    """And continues up to a shadow."""
     inverse = ramp(*slope)
     inverse[:, 70:] += height
+    inverse[40:60, 70 - dark : 70 + dark] = 0
     horizontal, vertical = plane_deviation(image_of(inverse), STEP)
     expected = np.zeros_like(horizontal)
-    expected[:, 69] = True
+    expected[:, 69] = inverse[:, 69] > 0
     np.testing.assert_array_equal(horizontal, expected)
     assert not vertical.any()
 
 
-OUTLINES = [
-    [(30, 20), (90, 20), (90, 70), (30, 70)],
-    [(30, 20), (95, 35), (80, 80), (20, 60)],
-    [(60, 10), (64, 90), (50, 90)],
-    [(20, 50), (60, 15), (100, 50), (60, 85)],
-]
-
-
-@pytest.mark.parametrize('outline', OUTLINES)
+@pytest.mark.parametrize(
+    'outline',
+    [
+        [(30, 20), (90, 20), (90, 70), (30, 70)],
+        [(30, 20), (95, 35), (80, 80), (20, 60)],
+        [(60, 10), (64, 90), (50, 90)],
+        [(20, 50), (60, 15), (100, 50), (60, 85)],
+    ],
+)
 def test_contours_of_objects_close(outline):
     """The object is one part, the background another, and nothing else is cut off."""
     front = object_of(outline)
@@ -153,15 +153,6 @@ def test_shadow_alone_makes_no_edge(detect):
     assert not horizontal.any() and not vertical.any()
 
 
-def test_jumps_continue_up_to_a_shadow():
-    inverse = ramp()
-    inverse[:, 70:] += 0.1
-    inverse[40:60, 66:74] = 0
-    horizontal, _ = plane_deviation(image_of(inverse), STEP)
-    assert horizontal[:40, 69].all() and horizontal[60:, 69].all()
-    assert not horizontal[40:60].any()
-
-
 @pytest.mark.parametrize('height', [0.2, -0.2])
 def test_sobel_finds_a_thin_line_beside_the_jump(height):
     image = image_of(ramp())
@@ -179,14 +170,8 @@ def test_bridging_joins_neighbours_that_do_not_touch():
     edges = np.array([[1, 0, 0], [1, 0, 1], [0, 0, 1]], bool)
     expected = np.array([[1, 1, 0], [1, 1, 1], [0, 1, 1]], bool)
     np.testing.assert_array_equal(bridge_edges(edges), expected)
-
-
-def test_bridging_leaves_touching_neighbours_alone():
-    edges = np.zeros((7, 7), bool)
-    edges[1:6, 3] = edges[3, 3:6] = True
-    corner = np.eye(7, dtype=bool)
-    np.testing.assert_array_equal(bridge_edges(corner), corner)
-    assert bridge_edges(edges)[edges].all()
+    touching = np.eye(7, dtype=bool)
+    np.testing.assert_array_equal(bridge_edges(touching), touching)
 
 
 @pytest.mark.parametrize('shape', [(1, 1), (1, 7), (2, 2), (5, 3)])
@@ -227,27 +212,18 @@ HOLES = {
 }
 
 
-def crease(noise=0.001):
-    """Inverse depth of two walls that meet in the middle, and the wall of each pixel."""
-    random = np.random.default_rng(1)
-    left, right = VIEW.rays @ np.array([0.2, 0.0, 0.6]), VIEW.rays @ np.array([-0.2, 0.0, 0.6])
-    inverse = np.maximum(left, right) + random.normal(0, noise, VIEW.shape)
-    return inverse, np.where(left > right, 1, 2)
-
-
 @pytest.mark.parametrize('cloud', [False, True])
 @pytest.mark.parametrize('holes', HOLES.values(), ids=HOLES)
 def test_holes_part_no_plane_and_stay_holes(holes, cloud):
-    inverse, truth = crease()
+    """Of two walls that meet in the middle."""
+    left, right = (VIEW.rays @ np.array([slope, 0, 0.6]) for slope in (0.2, -0.2))
+    inverse = np.maximum(left, right) + np.random.default_rng(1).normal(0, 0.001, VIEW.shape)
     depth = np.where(holes, np.nan, 1 / inverse).astype(np.float32)
-    image = RangeImage.from_depth(depth, VIEW)
-    if cloud:
-        image = cloud_of(depth[..., None] * VIEW.rays)
-    result = Segmenter(Config()).segment(image)
-    assert len(result.planes) == 2
-    assert not result.labels[holes].any()
-    for wall in (1, 2):
-        found = result.labels[(truth == wall) & ~holes]
+    seen = cloud_of(depth[..., None] * VIEW.rays) if cloud else RangeImage.from_depth(depth, VIEW)
+    result = Segmenter().segment(seen)
+    assert len(result.planes) == 2 and not result.labels[holes].any()
+    for wall in (left > right, left <= right):
+        found = result.labels[wall & ~holes]
         assert np.bincount(found).max() > 0.95 * len(found)
 
 
@@ -272,20 +248,12 @@ def test_a_hole_takes_the_mean_of_what_is_around_it(cloud):
     np.testing.assert_allclose(whole.inverse, np.where(bridged, mean, inverse), rtol=1e-5)
     expected = np.where((bridged & cloud)[..., None], np.dstack(rays), camera.rays)
     np.testing.assert_allclose(whole.rays, expected, rtol=1e-5, atol=1e-6)
-
-
-def test_an_image_without_holes_is_itself():
-    image = RangeImage(VIEW.rays, crease()[0].astype(np.float32), VIEW)
-    some = np.ones((30, 40), np.float32)
-    assert bridge_holes(image, some, some) is image
+    full = RangeImage(camera.rays, np.ones(camera.shape, np.float32))
+    assert bridge_holes(full, steps, slopes) is full, 'an image without holes is itself'
 
 
 def test_pixels_beside_edges_are_those_on_either_side():
     right, below = np.zeros((3, 4), bool), np.zeros((2, 5), bool)
     right[0, 1] = right[2, 3] = below[0, 4] = below[1, 2] = True
-    found = pixels_beside((right, below))
-    assert np.argwhere(found).tolist() == [
-        *([0, 1], [0, 2], [0, 4]),
-        *([1, 2], [1, 4]),
-        *([2, 2], [2, 3], [2, 4]),
-    ]
+    expected = [[0, 1, 1, 0, 1], [0, 0, 1, 0, 1], [0, 0, 1, 1, 1]]
+    np.testing.assert_array_equal(pixels_beside((right, below)), expected)

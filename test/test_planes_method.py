@@ -5,9 +5,8 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
-from rangeseg_ros import Camera, Config
-from rangeseg_ros.core.segmenter import Segmenter
-from rangeseg_ros.core.sensing.range_image import RangeImage, UnitWarning
+from rangeseg_ros import Camera, Config, RangeImage, Segmenter
+from rangeseg_ros.core.sensing.range_image import UnitWarning
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.label_files import as_truth
 from rangeseg_ros.evaluation.overlap import overlap_figures
