@@ -51,15 +51,14 @@ def test_bins_are_means_of_what_was_measured(shape, side, cloud):
         known = inverse[part][inverse[part] > 0]
         assert bins.means.inverse[i, j] == pytest.approx(known.mean() if len(known) else 0)
         assert bins.spread[i, j] == pytest.approx(np.ptp(known) if len(known) else 0)
-        if cloud and len(known):
+        # Those of a camera are of the middle of all pixels, were they in the image.
+        if not cloud:
+            middle = (np.array([j, i]) + 0.5) * side - 0.5
+            expected = [*(middle - 3) / 50, 1]
+            np.testing.assert_allclose(bins.means.rays[i, j], expected, atol=1e-6)
+        elif len(known):
             mean = rays[part][inverse[part] > 0].mean(axis=0)
             np.testing.assert_allclose(bins.means.rays[i, j], mean, rtol=1e-5)
-
-
-def test_rays_of_bins_are_those_of_the_middle_of_their_pixels():
-    bins = Bins.of(image_of(np.ones(CAMERA.shape)), 2)
-    mean = CAMERA.rays.reshape(240, 2, 320, 2, 3).mean(axis=(1, 3))
-    np.testing.assert_allclose(bins.means.rays, mean, atol=1e-6)
 
 
 def test_a_jump_mixes_no_two_surfaces():
@@ -167,21 +166,15 @@ def test_borders_are_those_of_pixels():
     rows, columns = np.indices(CAMERA.shape)
     at = (300.5 - CAMERA.cx) / CAMERA.fx
     right = WALL + np.array([0.5, 0, -0.5 * at])
-    truth = np.where(columns <= 300, 1, 2)
-    inverse = np.where(columns <= 300, CAMERA.rays @ WALL, CAMERA.rays @ right)
+    truth = np.where(columns > 300, 1, 2)
+    inverse = np.where(columns > 300, CAMERA.rays @ right, CAMERA.rays @ WALL)
     card = (rows >= 101) & (rows < 200) & (columns >= 51) & (columns < 150)
     truth[card], inverse[card] = 3, 1.0
     noise = np.random.default_rng(5).normal(0, 1e-4, CAMERA.shape)
     result = Segmenter().segment(image_of(inverse + noise))
-    assert len(result.planes) == 3
-    for label in (1, 2, 3):
-        own = result.labels[truth == label]
-        found = result.labels == np.bincount(own[own > 0]).argmax()
-        wrong = np.count_nonzero(found != (truth == label))
-        assert wrong < 0.2 * 480, 'less than a fifth of a pixel along the border'
-    assert [plane.count for plane in result.planes] == sorted(
-        (int((result.labels == k).sum()) for k in (1, 2, 3)), reverse=True
-    )
+    assert np.count_nonzero(result.labels != truth) < 0.2 * 480, 'a fifth of a pixel along one'
+    counts = [plane.count for plane in result.planes]
+    assert [0, *counts] == np.bincount(result.labels.flat).tolist()
 
 
 @pytest.fixture(scope='module')
