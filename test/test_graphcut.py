@@ -6,17 +6,9 @@ import maxflow
 import numpy as np
 import pytest
 
+from rangeseg_ros.core.graphcut import expansion
 from rangeseg_ros.core.graphcut.cut import minimum_cut
-from rangeseg_ros.core.graphcut.expansion import (
-    ROUNDING,
-    GridLabelling,
-    band,
-    energy,
-    expand,
-    fronts,
-    link_costs,
-    minimise,
-)
+from rangeseg_ros.core.graphcut.expansion import GridLabelling
 from rangeseg_ros.core.sensing.grid import Grid
 
 
@@ -26,23 +18,18 @@ def grid_graph(random, height, width, whole):
     number = np.where(inside, np.cumsum(inside).reshape(inside.shape) - 1, -1)
     count = int(inside.sum())
     neighbour, link = np.full((count, 4), -1, np.int32), np.zeros((count, 4))
-    for i, j in np.argwhere(inside):
-        for k, (a, b) in enumerate(((i, j + 1), (i + 1, j))):
-            if a < height and b < width and inside[a, b]:
-                p, q = number[i, j], number[a, b]
-                weight = random.integers(0, 4) if whole else random.exponential(2)
-                neighbour[p, k], neighbour[q, k + 2] = q, p
-                link[p, k] = link[q, k + 2] = weight
+    for k, pair in enumerate(((number[:, :-1], number[:, 1:]), (number[:-1], number[1:]))):
+        p, q = np.stack(pair)[:, np.minimum(*pair) >= 0]
+        weight = random.integers(0, 4, len(p)) if whole else random.exponential(2, len(p))
+        neighbour[p, k], neighbour[q, k + 2] = q, p
+        link[p, k] = link[q, k + 2] = weight
     excess = random.integers(-5, 6, count) if whole else random.normal(0, 3, count)
     return excess.astype(float), neighbour, link
 
 
 def value(chosen, excess, neighbour, link):
-    total = excess[chosen].sum()
-    for p, k in np.argwhere(neighbour >= 0):
-        if k < 2 and chosen[p] != chosen[neighbour[p, k]]:
-            total += link[p, k]
-    return total
+    parted = (neighbour >= 0) & (chosen[neighbour] != chosen[:, None])
+    return excess[chosen].sum() + link[:, :2][parted[:, :2]].sum()
 
 
 @pytest.mark.parametrize('whole', [True, False])
@@ -86,7 +73,7 @@ def test_each_expansion_is_the_best_of_its_space_and_in_the_end_none_helps(seed)
     unary = random.integers(0, 12, (4, 3, 3)).astype(np.float32)
     grid = Grid(*(random.choice([0.0, 0.5, 1.0, 2.0], shape) for shape in ((3, 2), (2, 3))))
     labels = random.integers(0, 4, (3, 3), np.int32)
-    data, links = np.take_along_axis(unary, labels[None], 0)[0], link_costs(grid, 3.0)
+    data, links = np.take_along_axis(unary, labels[None], 0)[0], expansion.link_costs(grid, 3.0)
     labelling = GridLabelling.of(labels.ravel(), data.ravel(), links, 3)
     taken = np.array(list(product([False, True], repeat=9))).reshape(-1, 3, 3)
 
@@ -96,10 +83,12 @@ def test_each_expansion_is_the_best_of_its_space_and_in_the_end_none_helps(seed)
     for alpha in (3, 1):
         sites, best = np.flatnonzero(labels != alpha).astype(np.int32), least(alpha)
         labelling.position[sites] = np.arange(len(sites))
-        expand(alpha, sites, unary[alpha].flat[sites], labelling, ROUNDING)
-        assert energies(labels[None], unary, grid)[0] == energy(data, labels, links) == best
-    minimise(labelling, 4, lambda label, pixels: unary[label].flat[pixels])
-    assert all(energy(data, labels, links) == least(alpha) for alpha in range(4))
+        expansion.expand(alpha, sites, unary[alpha].flat[sites], labelling, expansion.ROUNDING)
+        assert (
+            energies(labels[None], unary, grid)[0] == expansion.energy(data, labels, links) == best
+        )
+    expansion.minimise(labelling, 4, lambda label, pixels: unary[label].flat[pixels])
+    assert all(expansion.energy(data, labels, links) == least(alpha) for alpha in range(4))
 
 
 @pytest.mark.parametrize('rows', [(0, 14), (0, 6), (5, 14)])
@@ -112,7 +101,7 @@ def test_a_band_has_the_sites_so_near_to_a_label(reach, rows):
     links[0, :, -1] = links[1, -1] = 0
     costs = np.zeros(labels.size, np.float32)
     labelling = GridLabelling.of(labels.ravel(), costs, links.reshape(2, -1), 11)
-    start, sites = fronts(labelling, 4, rows)
+    start, sites = expansion.fronts(labelling, 4, rows)
     inside = np.zeros(labels.shape, bool)
     inside[slice(*rows)] = True
     right, down = links[0, :, :-1] > 0, links[1, :-1] > 0
@@ -123,7 +112,7 @@ def test_a_band_has_the_sites_so_near_to_a_label(reach, rows):
         own = np.flatnonzero((labels == alpha) & inside).astype(np.int32)
         front = np.concatenate([own[:3], front, front, own[3:]])
         labelling.position[:] = -1
-        found = band(alpha, front, reach, labelling, rows)
+        found = expansion.band(alpha, front, reach, labelling, rows)
         # The label's own count from beyond the rows, too; what is reached lies in them.
         reached = labels == alpha
         for _ in range(reach):

@@ -14,7 +14,8 @@ from rangeseg_ros.core.fitting.region_sums import POINT, sum_regions
 from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, roots, squares
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.moments import COUNT
-from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
+from rangeseg_ros.simulation.fields import smooth_field
 from rangeseg_ros.simulation.sensors.kinect import QUANTUM, kinect_camera
 
 KINECT = SensorModel(0.45 * QUANTUM, 0, 0.33, 2, 0.5 * QUANTUM, 0, 35)
@@ -22,10 +23,10 @@ CAMERA = kinect_camera()
 NORMAL, DISTANCE = np.array([0.36, -0.48, -0.8]), 2.0
 
 
-def plane_image(normal=NORMAL, distance=DISTANCE, camera=CAMERA, error=0.0):
-    """Range image of one plane, and the inverse range exactly."""
-    exact = -(camera.rays.astype(float) @ (np.asarray(normal) / distance))
-    return RangeImage(camera.rays, (exact + error).astype(np.float32), camera)
+def plane_image(distance=DISTANCE, error=0.0):
+    """Range image of one plane."""
+    exact = -(CAMERA.rays.astype(float) @ (NORMAL / distance))
+    return RangeImage(CAMERA.rays, (exact + error).astype(np.float32), CAMERA)
 
 
 def boxes(*corners):
@@ -35,15 +36,8 @@ def boxes(*corners):
     return labels
 
 
-def as_it_is(image):
-    return image
-
-
-def as_cloud(image):
-    return cloud_of(image.points)
-
-
-FORMS = pytest.mark.parametrize('form', [as_it_is, as_cloud])
+AS_CAMERA_OR_CLOUD = [lambda image: image, lambda image: cloud_of(image.points)]
+FORMS = pytest.mark.parametrize('form', AS_CAMERA_OR_CLOUD, ids=['camera', 'cloud'])
 
 
 def polygon_area(ring, normal):
@@ -142,9 +136,7 @@ def test_what_determines_no_plane_is_left_out():
 
 def test_parts_of_one_plane_share_a_surface_and_steps_do_not():
     labels = boxes((100, 100, 200, 200), (100, 300, 200, 400), (100, 210, 200, 290))
-    random = np.random.default_rng(2)
-    noise = 0.37 * QUANTUM * cv2.GaussianBlur(random.standard_normal(CAMERA.shape), (0, 0), 2)
-    noise *= np.sqrt(16 * np.pi)
+    noise = 0.37 * QUANTUM * smooth_field(CAMERA.shape, (2.0, 2.0), np.random.default_rng(2))
     image = plane_image(error=noise)
     assert [p.surface for p in fit_planes(labels, image, KINECT)] == [1, 1, 1]
     step = plane_image(distance=DISTANCE - 0.04, error=noise).inverse
@@ -279,9 +271,8 @@ def test_sums_over_cells_are_those_over_pixels(kind, view, radius):
 
     rows, columns = np.nonzero(mask)
     squared = (rows[:, None] - rows) ** 2 + (columns[:, None] - columns) ** 2
-    level = exact[mask] ** 4
-    random = sensor.noise**2 + sensor.range_noise**2 * level
-    systematic = sensor.distortion**2 + sensor.range_distortion**2 * level
+    random = random_variance(sensor, exact[mask] ** 2)
+    systematic = systematic_variance(sensor, exact[mask] ** 2)
     field = np.exp(-squared / 4 / sensor.correlation**2)
     field = sensor.white * np.eye(len(rows)) + (1 - sensor.white) * field
     errors = np.sqrt(np.outer(random, random)) * field

@@ -5,13 +5,7 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components as graph_components
 
-from rangeseg_ros.core.regions import (
-    connected_components,
-    least_pixels,
-    numbers_of,
-    plane_regions,
-    relabel,
-)
+from rangeseg_ros.core import regions
 from rangeseg_ros.core.sensing.grid import Grid
 
 
@@ -28,20 +22,21 @@ def test_components_of_random_images(seed):
     i = np.concatenate([index[:, :-1][right], index[:-1][below]])
     j = np.concatenate([index[:, 1:][right], index[1:][below]])
     count, expected = graph_components(coo_array((np.ones(len(i)), (i, j)), (h * w, h * w)))
-    found = connected_components(labels, Grid(horizontal, vertical), valid)
+    found = regions.connected_components(labels, Grid(horizontal, vertical), valid)
     pairs = np.unique(np.stack([found[valid], expected[valid.ravel()]]), axis=1)
     assert pairs.shape[1] == count - np.count_nonzero(~valid) == found.max()
     np.testing.assert_array_equal(found > 0, valid)
 
 
 def test_the_smallest_plane_follows_the_image():
-    assert [least_pixels(0, shape) for shape in ((480, 640), (240, 320), (1, 1))] == [300, 75, 1]
-    assert least_pixels(7, (480, 640)) == 7
+    sizes = (0, (480, 640)), (0, (240, 320)), (0, (1, 1)), (7, (480, 640))
+    assert [regions.least_pixels(*size) for size in sizes] == [300, 75, 1, 7]
 
 
 def test_regions_left_keep_their_order():
-    regions = np.array([[1, 1, 1, 1], [2, 2, 2, 3], [3, 4, 0, 0]], np.uint16)
-    found = relabel(regions, numbers_of(np.array([False, True, False, True, True])))
+    labels = np.array([[1, 1, 1, 1], [2, 2, 2, 3], [3, 4, 0, 0]], np.uint16)
+    numbers = regions.numbers_of(np.array([False, True, False, True, True]))
+    found = regions.relabel(labels, numbers)
     assert found.tolist() == [[1, 1, 1, 1], [0, 0, 0, 2], [2, 3, 0, 0]]
     assert found.dtype == np.uint16
 
@@ -52,5 +47,5 @@ def test_small_regions_and_shadow_are_no_plane():
     valid = np.ones((20, 20), bool)
     valid[:, 15:] = False
     uncut = Grid(np.ones((20, 19), bool), np.ones((19, 20), bool))
-    found = plane_regions(labels, valid, uncut, 26)
+    found = regions.plane_regions(labels, valid, uncut, 26)
     assert not found[:5, :5].any() and not found[:, 15:].any() and (found[5:, :15] == 1).all()
