@@ -94,17 +94,6 @@ def test_facets_of_a_cylinder_are_no_planes_together(radius, distance):
     assert (alone[1:] > 0.5).all() and (together[1:] < 0.2).all()
 
 
-@pytest.mark.parametrize('slope', [0.02, 0.1, 0.2])
-def test_a_bowed_wall_beside_what_does_not_go_on_is_a_plane(slope):
-    """The wall bends towards its neighbour, which is flat."""
-    beyond, columns = X - X[0, 270], np.arange(320)
-    inverse = 0.5 + np.where(beyond < 0, 0.04 * beyond**2, slope * beyond)
-    regions = np.where(beyond < 0, 1, 2) * (columns < 310)
-    alone, beside = alone_and_beside(inverse, regions, [1, 2])
-    np.testing.assert_allclose(beside, alone, atol=0.01)
-    assert alone[1] > 0.5
-
-
 def test_the_evidence_is_that_of_residuals_along_the_crease():
     """Against least squares of all cells at once."""
     inverse = 0.5 + 0.05 * X - 0.2 * X**2 - 0.05 * X * CAMERA.rays[..., 1]
