@@ -21,6 +21,7 @@ from rangeseg_ros.core.sensing.jump_edges import (
 
 STEP = 0.0044
 CAMERA = Camera(120, 100, 100.0, 100.0, 59.5, 49.5)
+Y, X = np.indices(CAMERA.shape)
 
 
 def image_of(inverse):
@@ -29,8 +30,7 @@ def image_of(inverse):
 
 def ramp(a=0.0, b=0.0, c=0.5):
     """Inverse depth of a plane."""
-    rows, columns = np.indices(CAMERA.shape)
-    return c + a * (columns - 60) + b * (rows - 50)
+    return c + a * (X - 60) + b * (Y - 50)
 
 
 def parts(edges):
@@ -47,16 +47,12 @@ def object_of(outline):
     return cv2.fillPoly(np.zeros(CAMERA.shape, np.uint8), [np.array(outline)], 1) > 0
 
 
-def creased(axis, slope, width):
-    """A face that is steep from pixel to pixel, and may be too narrow for its slope to be told."""
-    crease = CAMERA.shape[axis] - 1 - width
-    return 1.0 + slope * np.maximum(np.indices(CAMERA.shape)[axis] - crease, 0)
-
-
 CONTINUOUS = [ramp(*slope, c=1.0) for slope in ((0, 0), (0.002, -0.001), (-0.004, 0.003))]
-CONTINUOUS += [ramp(0.0007) + h * STEP * (np.indices(CAMERA.shape)[1] > 60) for h in (-0.9, 0.9)]
-CONTINUOUS += [0.8 + a * 0.004 * np.abs(np.indices(CAMERA.shape)[1] - 57.3) for a in (-1, 1)]
-CONTINUOUS += [creased(a, s, w) for a in (0, 1) for s in (10 * STEP, -10 * STEP) for w in (12, 20)]
+CONTINUOUS += [ramp(0.0007) + h * STEP * (X > 60) for h in (-0.9, 0.9)]
+CONTINUOUS += [0.8 + a * 0.004 * np.abs(X - 57.3) for a in (-1, 1)]
+# Faces that are steep from pixel to pixel, and may be too narrow for their slope to be told.
+STEEP = [np.maximum(place - place.max() + width, 0) for place in (Y, X) for width in (12, 20)]
+CONTINUOUS += [1.0 + slope * STEP * face for slope in (10, -10) for face in STEEP]
 
 
 @pytest.mark.parametrize('inverse', CONTINUOUS)
@@ -146,9 +142,8 @@ def test_no_link_joins_an_object_and_what_is_behind(detector, heights, shadow, s
 @pytest.mark.parametrize('detect', [lambda i: plane_deviation(i, STEP), sobel])
 def test_shadow_alone_makes_no_edge(detect):
     inverse = ramp(0.0003, 0.0002)
-    inverse[20:40, 30:50] = 0
-    inverse[60, 10:100] = 0
-    inverse[70:90, 80] = 0
+    for shadow in (np.s_[20:40, 30:50], np.s_[60, 10:100], np.s_[70:90, 80]):
+        inverse[shadow] = 0
     horizontal, vertical = detect(image_of(inverse))
     assert not horizontal.any() and not vertical.any()
 
