@@ -9,15 +9,10 @@ from clouds import cloud_of
 from scipy.ndimage import correlate, maximum_filter, minimum_filter
 
 from rangeseg_ros import Camera, RangeImage, Segmenter
+from rangeseg_ros.core.sensing import jump_edges
 from rangeseg_ros.core.sensing.bridges import bridge_holes
 from rangeseg_ros.core.sensing.grid import grid_of
-from rangeseg_ros.core.sensing.jump_edges import (
-    bridge_edges,
-    jump_edges,
-    pixels_beside,
-    plane_deviation,
-    sobel,
-)
+from rangeseg_ros.core.sensing.jump_edges import plane_deviation, sobel
 
 STEP = 0.0044
 CAMERA = Camera(120, 100, 100.0, 100.0, 59.5, 49.5)
@@ -133,7 +128,7 @@ def test_no_link_joins_an_object_and_what_is_behind(detector, heights, shadow, s
         dark = np.any(moved, axis=0) & ~front
         for height, slope in product(heights, (0, 0.0009)):
             image = image_of((ramp(slope) + height * front) * ~dark)
-            grid = grid_of(image, jump_edges(image, detector, STEP))
+            grid = grid_of(image, jump_edges.jump_edges(image, detector, STEP))
             found = parts([links == 0 for links in grid])
             both = np.intersect1d(found[front], found[~front & ~dark])
             assert not both.size, (angle, height, slope)
@@ -164,9 +159,9 @@ def test_bridging_joins_neighbours_that_do_not_touch():
     """The example in the documentation of MATLAB's bwmorph(..., 'bridge')."""
     edges = np.array([[1, 0, 0], [1, 0, 1], [0, 0, 1]], bool)
     expected = np.array([[1, 1, 0], [1, 1, 1], [0, 1, 1]], bool)
-    np.testing.assert_array_equal(bridge_edges(edges), expected)
+    np.testing.assert_array_equal(jump_edges.bridge_edges(edges), expected)
     touching = np.eye(7, dtype=bool)
-    np.testing.assert_array_equal(bridge_edges(touching), touching)
+    np.testing.assert_array_equal(jump_edges.bridge_edges(touching), touching)
 
 
 @pytest.mark.parametrize('shape', [(1, 1), (1, 7), (2, 2), (5, 3)])
@@ -251,4 +246,4 @@ def test_pixels_beside_edges_are_those_on_either_side():
     right, below = np.zeros((3, 4), bool), np.zeros((2, 5), bool)
     right[0, 1] = right[2, 3] = below[0, 4] = below[1, 2] = True
     expected = [[0, 1, 1, 0, 1], [0, 0, 1, 0, 1], [0, 0, 1, 1, 1]]
-    np.testing.assert_array_equal(pixels_beside((right, below)), expected)
+    np.testing.assert_array_equal(jump_edges.pixels_beside((right, below)), expected)

@@ -55,9 +55,8 @@ def random_case(seed, height, width, count=3):
 
 def unary(problem, models):
     """Cost (K + 1, H, W) of every label at every pixel, from the definition."""
-    rows, columns = np.divmod(np.arange(len(problem.rays)), problem.width) // np.int64(BLOCK)
-    labels = range(len(models.theta))
-    blocks = list(zip(rows, columns, strict=True))
+    pixels = np.ndindex(len(problem.rays) // problem.width, problem.width)
+    blocks, labels = [(i // BLOCK, j // BLOCK) for i, j in pixels], range(len(models.theta))
     shift = [[shift_at(models.shifts, label, *block) for block in blocks] for label in labels]
     residual = problem.inverse - (1 + np.array(shift)) * (models.theta @ problem.rays.T)
     cost = np.minimum(residual**2 * problem.weight * models.half_precision[:, None], 8.0)
