@@ -23,9 +23,9 @@ CAMERA = kinect_camera()
 NORMAL, DISTANCE = np.array([0.36, -0.48, -0.8]), 2.0
 
 
-def plane_image(distance=DISTANCE, error=0.0):
+def plane_image(distance=DISTANCE, error=0.0, normal=NORMAL):
     """Range image of a plane."""
-    exact = -(CAMERA.rays.astype(float) @ NORMAL) / distance
+    exact = -(CAMERA.rays.astype(float) @ normal) / distance
     return RangeImage(CAMERA.rays, (exact + error).astype(np.float32), CAMERA)
 
 
@@ -44,7 +44,8 @@ FORMS = pytest.mark.parametrize('form', AS_CAMERA_OR_CLOUD, ids=['camera', 'clou
 def test_the_length_points_to_the_right_of_the_image(degrees):
     corners = cv2.boxPoints(((320, 240), (180, 40), degrees)).round().astype(int)
     labels = cv2.fillPoly(np.zeros(CAMERA.shape, np.uint8), [corners], 1)
-    (plane,) = fit_planes(labels.astype(np.uint16), plane_image((0.48, -0.6, -0.64)), KINECT)
+    image = plane_image(normal=np.array([0.48, -0.6, -0.64]))
+    (plane,) = fit_planes(labels.astype(np.uint16), image, KINECT)
     assert plane.shape.frame[0, 0] > 0 and plane.extents[0] > 2 * plane.extents[1]
 
 
