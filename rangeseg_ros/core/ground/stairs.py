@@ -163,14 +163,9 @@ def _staircase(
     fitted = _fit_noses(number, place) if last - first > 1 else None
     if fitted is None:
         return None
-    start, ahead, run, fits = fitted
+    start, ahead, run = fitted
     across = np.array([-ahead[1], ahead[0]])
-    sides = []
-    for k in range(first, last):
-        here = fits & (number == k)
-        if here.sum() < SAMPLES:
-            return None
-        sides.append(np.quantile(place[here] @ across, (0.02, 0.98)))
+    sides = [np.quantile(place[number == k] @ across, (0.02, 0.98)) for k in range(first, last)]
     # Boxes of several heights stand side by side, treads one behind the other.
     for (left, right), (low, high) in pairwise(sides):
         if min(right, high) - max(left, low) < min(right - left, high - low) / 2:
@@ -178,35 +173,30 @@ def _staircase(
     ends = sides[0]
     if sign < 0:  # columns of cells that leave the stairs at their side see no nose there
         ends = np.quantile(across @ cells.place[1:, tread == 1], (0.02, 0.98))
-    width = float(ends[1] - ends[0])
-    if width < run:  # treads are wider than deep
-        return None
     treads = last - first  # going down, there is one beyond each nose
     levels = np.array([np.median(level[tread == k]) for k in range(1, treads + 1)])
     steps = np.arange(1, treads + 1)
     edge = (start + first * run) * ahead + np.outer(ends, across)
     return Stairs(
-        _on_ground(edge, terrain), width, treads, float(levels @ steps / (steps @ steps)), run,
-        'up' if sign > 0 else 'down',
+        _on_ground(edge, terrain), float(np.ptp(ends)), treads,
+        float(levels @ steps / (steps @ steps)), run, 'up' if sign > 0 else 'down',
     )  # fmt: skip
 
 
 def _fit_noses(
     number: NDArray[np.int64], place: NDArray[np.float64]
-) -> tuple[float, NDArray[np.float64], float, NDArray[np.bool_]] | None:
-    """Where tread 0 has its nose, direction, run, and which noses fit; None for no stairs."""
+) -> tuple[float, NDArray[np.float64], float] | None:
+    """Where tread 0 has its nose, direction and run; None where half of the noses do not fit."""
     design = np.column_stack([np.ones(len(place)), place])
     fits = np.ones(len(design), np.bool_)
     for _ in range(4):
         solved = np.linalg.lstsq(design[fits], number[fits].astype(float), rcond=None)[0]
         off = np.abs(design @ solved - number)
         fits = off <= max(_UNEVEN, float(np.median(off)))
-    fits = off <= _UNEVEN
     slope = float(np.linalg.norm(solved[1:]))
-    if 2 * fits.sum() < len(fits) or not 1 / _RUN[1] <= slope <= 1 / _RUN[0]:
+    if np.median(off) > _UNEVEN or not 1 / _RUN[1] <= slope <= 1 / _RUN[0]:
         return None
-    ahead = solved[1:] / slope
-    return -float(solved[0]) / slope, ahead, 1 / slope, fits
+    return -float(solved[0]) / slope, solved[1:] / slope, 1 / slope
 
 
 def _on_ground(ends: NDArray[np.float64], terrain: Terrain) -> NDArray[np.float64]:
