@@ -204,6 +204,8 @@ def test_right_angles_are_exact_only_where_the_covariance_allows_it():
     assert [s.exact for s in squared] == ['square', 'square', 'plumb', 'square']
     assert abs(squared[0].normal @ squared[1].normal) < 1e-12
     assert abs(np.cross(squared[0].normal, squared[3].normal)).max() < 1e-12
+    # Both walls that are known as well turn as far towards each other.
+    assert squared[0].normal[:2] == pytest.approx(turned(19.9)[:2], abs=1e-3)
     assert all(s.turned < np.radians(5) and abs(s.normal[2]) < 1e-12 for s in squared)
     for before, after in zip(walls, squared, strict=True):
         # It turns about where it is known best, and the outline lies on it.
