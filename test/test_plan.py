@@ -257,11 +257,11 @@ def sighted(edge, direction, pose, random, count):
 
 def test_stairs_of_several_frames_are_one_flight():
     random, seen = np.random.default_rng(1), []
-    up = np.array([[2.0, -0.6, 0.0], [2.0, 0.6, 0.0]])
-    down = np.array([[-1.0, 3.0, 0.0], [-2.2, 3.0, 0.0]])
+    up = np.array([[-2.0, -5.6, 0.0], [-2.0, -4.4, 0.0]])
+    down = np.array([[-5.0, -2.0, 0.0], [-6.2, -2.0, 0.0]])
     for k in range(9):
         turn = Rotation.from_euler('zyx', random.uniform(-30, 30, 3), degrees=True).as_matrix()
-        pose = Transform(turn, np.array([0.1 * k - 1, 0.05 * k, 1.0]))
+        pose = Transform(turn, np.array([0.1 * k - 5, 0.05 * k - 5, 1.0]))
         seen.append(sighted(up, 'up', pose, random, 2 + k % 3))
         seen.append(sighted(down, 'down', pose, random, 3))
         if k < 2:  # too few to be sure
@@ -270,9 +270,9 @@ def test_stairs_of_several_frames_are_one_flight():
     assert (first.direction, second.direction) == ('up', 'down')
     assert str(first) == 'stairs up, 4 x 0.17 / 0.28 m'
     # Upwards along x, and downwards along y, away from the camera.
-    for flight, axis, begin, count in ((first, 0, 2, 5), (second, 1, 3, 4)):
+    for flight, axis, count in ((first, 0, 5), (second, 1, 4)):
         places = flight.edges[:, :, axis].mean(axis=1)
-        np.testing.assert_allclose(places, begin + 0.28 * np.arange(count), atol=0.02)
+        np.testing.assert_allclose(places, -2 + 0.28 * np.arange(count), atol=0.02)
     np.testing.assert_allclose(np.ptp(first.edges[:, :, 1], axis=1), 1.2, atol=0.15)
     assert flights([]) == []
 
