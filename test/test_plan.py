@@ -20,9 +20,10 @@ from scipy.spatial.transform import Rotation
 from rangeseg_ros import Camera, Transform
 from rangeseg_ros.cli.main import rangeseg
 from rangeseg_ros.core.ground.stairs import Stairs
+from rangeseg_ros.core.mapping.plane_grid import PlaneGrid
 from rangeseg_ros.io.plans import write_dxf, write_geojson
 from rangeseg_ros.plan.flights import Flight, flights
-from rangeseg_ros.plan.floor_plan import FloorPlan, Up, estimate_up
+from rangeseg_ros.plan.floor_plan import FREE, FloorPlan, Up, Wall, _openings, estimate_up
 from rangeseg_ros.plan.right_angles import square_up
 from rangeseg_ros.report.plan import svg
 from rangeseg_ros.simulation.scenes import OPTICAL_IN_BODY
@@ -253,6 +254,18 @@ def sighted(edge, direction, pose, random, count):
     ends = edge[0] + np.outer([left, right], edge[1] - edge[0])
     ends = ends[:: random.choice([-1, 1])] + random.normal(0, 0.01, (2, 3))
     return Stairs(pose.inverse().apply(ends), 1.2, count, 0.17, 0.28, direction), pose
+
+
+def test_openings_are_wide_and_the_ground_was_seen_in_them():
+    """Gaps along x of which one is narrower than two cells, and of one half was not seen."""
+    grid = PlaneGrid(0.1)
+    grid.reach(np.array([(0, 0), (4, 0)]))
+    free = np.full(grid.odds.shape, FREE)
+    free[:, 25:] = FREE + 1
+    places = np.array([(0, 1), (1.15, 1.5), (2, 2.25), (2.85, 4)])
+    wall = Wall(7, np.stack([places, np.full_like(places, 0.05)], axis=-1))
+    (opening,) = _openings(wall, free, grid)
+    assert opening.plane == 7 and opening.ends[:, 0].tolist() == [1.5, 2]
 
 
 def test_stairs_of_several_frames_are_one_flight():

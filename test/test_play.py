@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from ros_bench import DEPTH, INFO, Bench, ended, values_of
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 
+from rangeseg_ros.cli import play
 from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
@@ -77,13 +79,18 @@ time.sleep(0.5)
     assert values_of(status)['messages lost by the middleware'] == '0'
 
 
-def test_topics_that_ros_refuses_are_left_out(tmp_path, run):
-    recording = Recording()
-    recording.add_camera(1, topic='/a b')
-    recording.add_camera(2, topic='/fine')
+def test_topics_that_ros_refuses_are_left_out_and_messages_are_in_time(tmp_path, run, monkeypatch):
+    slept, recording = [], Recording()
+    time = SimpleNamespace(monotonic=lambda: sum(slept), sleep=slept.append)
+    monkeypatch.setattr(play, 'time', time)
+    recording.add_camera(10**9, topic='/a b')
+    for second in (3, 9):
+        recording.add_camera(second * 10**9, topic='/fine')
     recording.write(tmp_path / 'bag')
-    code, output, _ = run('play', tmp_path / 'bag')
+    code, output, _ = run('play', tmp_path / 'bag', '--rate', 4)
     assert code == 0 and "'/a b' is no topic of ROS 2, left out" in output
+    # A second for whoever subscribes, and the six between the messages.
+    assert sum(slept) == pytest.approx(1 + 6 / 4)
     assert run('play', tmp_path / 'bag', '--rate', 'nan')[0] == 2
 
 

@@ -75,6 +75,7 @@ def test_the_edge_is_in_the_frame_of_a_cloud():
     ('run', 'sides', 'count'),
     [
         (0.28, [ALL], None),
+        (0.28, 2 * [SIDES], 2),
         (0.2, 3 * [SIDES], None),
         (0.45, 3 * [SIDES], None),
         # Noses as wide as treads share, of which each next pair has half in common, or less.
