@@ -81,16 +81,18 @@ def test_a_jump_mixes_no_two_surfaces():
     np.testing.assert_array_equal(found[near], bins.means.inverse[near])
 
 
-@pytest.mark.parametrize(('width', 'side'), [(0, 2), (0, 3), (3.0, 2)])
-def test_noise_of_pixels_follows_from_that_of_bins(width, side):
+@pytest.mark.parametrize(('width', 'side', 'power'), [(0, 2, 0), (0, 3, 2), (3.0, 2, 0)])
+def test_noise_of_pixels_follows_from_that_of_bins(width, side, power):
     """White noise of variance 1 leaves means of n pixels 1 / n, correlated noise nearly all."""
     random = np.random.default_rng(3)
     noise = smooth_field(CAMERA.shape, (width, width) if width else None, random)
-    image = image_of(CAMERA.rays @ WALL + 0.002 * noise)
-    bins = Bins.of(image, side)
-    residual = bins.means.inverse - bins.means.rays @ WALL.astype(np.float32)
-    stated = SensorModel.from_config(Config())._replace(noise=float(residual.std()))
-    assert stated.noise**2 * bins.noise_of_pixels(stated) == pytest.approx(0.002**2, rel=0.1)
+    level = CAMERA.rays @ WALL
+    bins = Bins.of(image_of(level + 0.002 * level**power * noise), side)
+    level = bins.means.rays @ WALL
+    error = ((bins.means.inverse - level) / level**power).std()
+    stated = SensorModel.from_config(Config(noise=0.0, range_noise=0.0))
+    stated = stated._replace(**{'range_noise' if power else 'noise': float(error)})
+    assert error**2 * bins.noise_of_pixels(stated) == pytest.approx(0.002**2, rel=0.1)
 
 
 @pytest.mark.parametrize(('correlation', 'white'), [(0.0, 1.0), (2.0, 0.1), (2.0, 0.5)])
