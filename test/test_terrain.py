@@ -135,6 +135,8 @@ def test_crossings_leave_no_cell_of_a_costmap_free_beyond_an_edge(edge, find):
     else:
         assert np.isnan(points[:, 3]).all()
         assert (result.terrain[frame.depth == 0] == UNKNOWN).all()
+        farthest = 1 / image.inverse[image.valid & (result.terrain <= GROUND)].min()
+        assert points[:, 2].max() <= 1.0001 * farthest
     lethal = {(x + n, y) for x, y in np.floor(world[:, :2] / 0.05).astype(int) for n in (-1, 0, 1)}
     first = round(edge / 0.05) + 2
     assert {(x, y) for x in range(first, first + 6) for y in range(-10, 10)} <= lethal
