@@ -238,11 +238,8 @@ def test_up_is_as_good_as_unknown_where_nothing_tells_it():
     normals = (1, 0, 0.1754), (1, 1, -0.2468), (-1, 1, 0.2063), (0, 0, 1)
     planes = [plane(k, n, (0, 0, 0), (0.001, 0.1, 0.1, 1)[k]) for k, n in enumerate(normals)]
     untold = 'planes that do not tell it'
-    for some, degrees, source in (
-        ([], 10, 'the images'),
-        (planes, 10, untold),
-        (planes, 0, untold),
-    ):
+    cases = ([], 10, 'the images'), (planes, 10, untold), (planes, 0, untold)
+    for some, degrees, source in cases:
         up = estimate_up(some, np.array([0, 0, 2.0]), np.radians(degrees))
         assert (up.deviation, up.source) == (np.pi / 4, source)
         assert up.direction.tolist() == [0, 0, 1]
