@@ -28,6 +28,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from rosbags import rosbag1, rosbag2
 
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [os.fspath(ROOT), os.fspath(ROOT / 'test')]
@@ -37,6 +38,8 @@ from recordings import Recording  # noqa: E402
 from rangeseg_ros import Camera, segment  # noqa: E402
 from rangeseg_ros.io.cameras import write_camera  # noqa: E402
 
+COMPRESSIONS = {kind.name: [kind] for kind in rosbag1.Writer.CompressionFormat}
+COMPRESSIONS |= {k.name: [k, rosbag2.CompressionFormat.ZSTD] for k in rosbag2.CompressionMode}
 RANGESEG = [sys.executable, '-c', 'from rangeseg_ros.start import rangeseg; rangeseg()']
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
 WALL = np.full((48, 64), 1500, np.uint16)
@@ -93,7 +96,7 @@ def recorded(path, count=4, storage='mcap', compression=None):
         noise = np.random.default_rng(stamp).integers(0, 9, WALL.shape, np.uint16)
         recording.add_camera(stamp)
         recording.add_image(stamp, WALL + noise)
-    return recording.write(Path(path), storage, compression)
+    return recording.write(Path(path), storage, compression and COMPRESSIONS[compression])
 
 
 def labelled():

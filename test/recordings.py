@@ -77,14 +77,16 @@ class Recording:
         message = self.store.types[kind](transforms=transforms)
         self.messages.append((stamp, '/tf_static' if static else '/tf', kind, message))
 
-    def write(self, path, storage='mcap'):
-        """Write all messages; the file that holds them."""
+    def write(self, path, storage='mcap', compression=()):
+        """Write all messages, compressed as its writer is told; the file that holds them."""
         if self.ros1:
             writer, serialize = rosbag1.Writer(path), self.store.serialize_ros1
         else:
             plugin = rosbag2.StoragePlugin[storage.upper()]
             writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
             serialize = self.store.serialize_cdr
+        if compression:
+            writer.set_compression(*compression)
         with writer:
             connections = {}
             for stamp, topic, kind, message in self.messages:

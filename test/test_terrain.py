@@ -236,7 +236,6 @@ def test_ground_between_a_wall_and_a_hole_is_no_slope():
     rows, columns = np.indices((90, 40))
     hole = (rows >= 16) & (rows < 24) & (abs(columns - 20) < 8)
     height = np.where(hole, -0.5, 0.05 * np.maximum(rows - 50, 0))
-    ahead = 1.0 + 0.04 * np.minimum(rows, 50)
-    place = np.stack([height, ahead, 0.04 * (columns - 20)])[:, ::-1]
+    place = np.stack([height, 1 + 0.04 * np.minimum(rows, 50), 0.04 * (columns - 20)])[:, ::-1]
     reached = reach(place, np.full(rows.shape, 0.006**2), Config(), False)[::-1]
     assert reached[25:49].all() and not reached[hole].any() and not reached[51:].any()
