@@ -16,10 +16,13 @@ import stat
 import sys
 import tempfile
 import warnings
+from importlib import metadata
+from itertools import chain
 from pathlib import Path
 
 PACKAGE = Path(__file__).parent
-# Beside the kernels of the core: the sources that all kernels of the package were compiled from.
+# Beside the kernels of the core: the sources that all kernels of the package were compiled from,
+# and the version of numba.
 _SOURCES = Path('core', '__pycache__', 'compiled_from.json')
 # The same of wheels with compiled kernels: their processor, and version of numba.
 _TARGET = Path('core', '__pycache__', 'compiled_for.json')
@@ -66,8 +69,6 @@ def _choose_processor() -> None:
     target = _read(PACKAGE / _TARGET)
     if not target or 'NUMBA_CPU_NAME' in os.environ:
         return
-    from importlib import metadata
-
     from llvmlite import binding
 
     has = binding.get_host_cpu_features()
@@ -93,7 +94,7 @@ def writable(folder: Path) -> bool:
 
 def _own_folder(root: Path) -> Path | None:
     """Folder within `root` for this state of the sources; None where it is not ours alone."""
-    state = hashlib.sha256(repr(_digests(PACKAGE)).encode()).hexdigest()
+    state = hashlib.sha256(repr(_state(PACKAGE)).encode()).hexdigest()
     name = f'rangeseg_ros-{state[:16]}'
     # Other than a process that was told of it by the one that started it.
     folder = root if root.name == name else root / name
@@ -133,17 +134,28 @@ def _temporary_folder() -> Path:
 
 
 def drop_outdated(package: Path) -> None:
-    """Remove kernels compiled beside sources that have changed, or that import such sources."""
-    note, now = package / _SOURCES, _digests(package)
+    """Remove kernels compiled beside sources that have changed, or that import such sources.
+
+    And all of another version of numba, which reads its index of a kernel before its code: if the
+    one was replaced and the other not, as on a full disk, it would run or refuse what is old.
+    """
+    note, now = package / _SOURCES, _state(package)
     before = _read(note)
     if now == before:
         return
     changed = {name for name, _ in now.items() ^ before.items()}
+    outdated = [package.rglob('__pycache__/*.nb[ic]')] if 'numba' in changed else []
     for name in _dependents(package, changed):
         source = package.parent / name.replace('.', '/')
-        for compiled in (source.parent / '__pycache__').glob(f'{source.name}.*.nb[ic]'):
-            compiled.unlink(missing_ok=True)
+        outdated.append((source.parent / '__pycache__').glob(f'{source.name}.*.nb[ic]'))
+    for compiled in chain.from_iterable(outdated):
+        compiled.unlink(missing_ok=True)
     _replace(note, json.dumps(now).encode())
+
+
+def _state(package: Path) -> dict[str, str]:
+    """What kernels are compiled from: the sources of the core, and the version of numba."""
+    return {**_digests(package), 'numba': metadata.version('numba')}
 
 
 def _read(note: Path) -> dict[str, str]:

@@ -244,8 +244,7 @@ def test_z_is_up_and_x_forward_whatever_the_camera_sees():
         np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
         np.testing.assert_allclose(turn @ up / np.linalg.norm(up), (0, 0, 1), atol=1e-12)
         assert turn[0, 2] >= -1e-12 and abs(turn[1, 2]) < 1e-12
-    # Of one that looks straight down the top of the image is ahead.
-    assert turn[0].tolist() == [0, -1, 0]
+    assert turn[0].tolist() == [0, -1, 0]  # straight down: the top of the image
 
 
 def test_stamps_that_do_not_tell_and_gaps_are_no_trouble():
