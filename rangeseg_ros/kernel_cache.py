@@ -17,12 +17,10 @@ import sys
 import tempfile
 import warnings
 from importlib import metadata
-from itertools import chain
 from pathlib import Path
 
 PACKAGE = Path(__file__).parent
-# Beside the kernels of the core: the sources that all kernels of the package were compiled from,
-# and the version of numba.
+# Beside the kernels of the core: what all kernels of the package were compiled from, see `_state`.
 _SOURCES = Path('core', '__pycache__', 'compiled_from.json')
 # The same of wheels with compiled kernels: their processor, and version of numba.
 _TARGET = Path('core', '__pycache__', 'compiled_for.json')
@@ -144,12 +142,12 @@ def drop_outdated(package: Path) -> None:
     if now == before:
         return
     changed = {name for name, _ in now.items() ^ before.items()}
-    outdated = [package.rglob('__pycache__/*.nb[ic]')] if 'numba' in changed else []
-    for name in _dependents(package, changed):
-        source = package.parent / name.replace('.', '/')
-        outdated.append((source.parent / '__pycache__').glob(f'{source.name}.*.nb[ic]'))
-    for compiled in chain.from_iterable(outdated):
-        compiled.unlink(missing_ok=True)
+    outdated = _dependents(package, changed)
+    for compiled in package.rglob('__pycache__/*.nb[ic]'):
+        source = compiled.parents[1] / compiled.name.partition('.')[0]
+        name = '.'.join(source.relative_to(package.parent).parts)
+        if 'numba' in changed or name in outdated:
+            compiled.unlink(missing_ok=True)
     _replace(note, json.dumps(now).encode())
 
 
@@ -190,6 +188,8 @@ def _dependents(package: Path, changed: set[str]) -> set[str]:
 
 def _copy_compiled(folder: Path) -> None:
     """Copy kernels compiled into the package to where numba looks for them in `folder`."""
+    if _read(PACKAGE / _SOURCES) != _state(PACKAGE):
+        return
     from numba.core.caching import _CacheLocator
 
     for compiled in PACKAGE.rglob('__pycache__/*.nb[ic]'):

@@ -102,8 +102,7 @@ def test_folders_named_by_the_user_come_first_but_where_others_can_write(tmp_pat
     assert run.returncode == 0
     # Of a folder that is the user's in one that all may write to, as /tmp, nobody can change it.
     assert ('poison' in run.stdout) == (mode == 0o1777)
-    told = 'is not used' in run.stderr
-    assert told == (variable == KEPT and mode != 0o1777)
+    assert ('is not used' in run.stderr) == (variable == KEPT and mode != 0o1777)
 
 
 @pytest.mark.parametrize(
@@ -131,10 +130,12 @@ def test_what_was_compiled_into_the_package_is_taken_along(tmp_path, monkeypatch
     compiled.parent.mkdir(parents=True)
     compiled.write_bytes(b'index')
     monkeypatch.setattr(cache, 'PACKAGE', tmp_path / 'package')
-    folder = tmp_path / 'cache'
+    note, folder = compiled.with_name('compiled_from.json'), tmp_path / 'cache'
     folder.mkdir()
-    for _ in range(2):
+    for numba in ('0', *2 * [cache._state(cache.PACKAGE)['numba']]):
+        note.write_text(f'{{"numba": "{numba}"}}')
         cache._copy_compiled(folder)
+        assert any(folder.rglob('*.*')) == (numba != '0')
     subfolder = _CacheLocator.get_suitable_cache_subpath(compiled.parents[1] / 'grid.py')
     assert [p.relative_to(folder) for p in folder.rglob('*.*')] == [Path(subfolder, compiled.name)]
 
