@@ -46,14 +46,13 @@ tempfile.tempdir = allowed or '/proc'
 KERNEL = 'from rangeseg_ros.core.by_normals.labelling import degrees\ndegrees(1.0)'
 # Prints when it is unpickled, as numba does with what it finds.
 CODE_IN_A_PICKLE = 2 * b"cbuiltins\nprint\n(S'poison'\ntR."
-INHERITED = {k: v for k, v in os.environ.items() if k != 'NUMBA_CACHE_DIR'}
 KEPT, CACHE = 'NUMBA_CACHE_DIR', 'XDG_CACHE_HOME'
 
 
 def run_restricted(code, allowed='', **environment):
     """Run Python where only one folder can be written to, or none."""
-    home = {'HOME': '/proc/none', CACHE: '/proc/none'}
-    return python(RESTRICT + code, allowed, cwd=ROOT, env={**INHERITED, **home, **environment})
+    home = {'HOME': '/proc/none', CACHE: '/proc/none', KEPT: ''}
+    return python(RESTRICT + code, allowed, cwd=ROOT, env={**os.environ, **home, **environment})
 
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason='PYTHONSAFEPATH is of Python 3.11')
@@ -116,6 +115,12 @@ def test_a_group_with_the_number_of_its_user_is_the_user(monkeypatch, mode, grou
     assert cache._private(Path('/somewhere/else')) == private
 
 
+def test_linear_algebra_is_imported_for_kernels_that_call_it():
+    code = 'from rangeseg_ros import Segmenter\nimport sys, numba, numpy\n' + KERNEL
+    code += "\nassert 'scipy.linalg' not in sys.modules\n"
+    assert not python(code + 'numba.njit(lambda a: a @ a)(numpy.eye(2))').stderr
+
+
 def test_import_and_help_load_no_kernel():
     """So they need no place to write to."""
     code = "import rangeseg_ros\nassert 'numba' not in sys.modules\nsys.argv[1:] = ['--help']\n"
@@ -167,7 +172,8 @@ def test_kernels_are_compiled_anew_when_what_they_call_has_changed(tmp_path):
         (package / f'{name}.py').write_text(text)
 
     def call():
-        done = python(CALL, cwd=tmp_path, env={**INHERITED, 'PYTHONPATH': os.fspath(ROOT)})
+        environment = {**os.environ, KEPT: '', 'PYTHONPATH': os.fspath(ROOT)}
+        done = python(CALL, cwd=tmp_path, env=environment)
         return done.stdout.split() or done.stderr
 
     assert call() == ['1', '3', '0', '0']
@@ -262,8 +268,7 @@ Segmenter(Config(method='normals')).segment(image)
 
 def test_the_first_frame_says_that_kernels_are_compiled(tmp_path):
     """In Python, without the command line, as the configuration needs them."""
-    environment = {**os.environ, 'NUMBA_CACHE_DIR': os.fspath(tmp_path)}
-    run = python(FIRST_FRAME, env=environment)
+    run = python(FIRST_FRAME, env={**os.environ, KEPT: os.fspath(tmp_path)})
     begin = 'rangeseg_ros: compiling kernels, once after the installation'
     assert run.stderr.splitlines() == [begin, "('image',), normals"]
 

@@ -62,9 +62,8 @@ class Replay:
     """Segmentation of one recording.
 
     The bag among the results gets its name when all else is complete. It marks the recording as
-    done, and a further `run` leaves it alone as long as recording, parameters, code
-    and the other results are the same; any other state is started anew, as ids depend on all
-    frames before.
+    done, and a further `run` leaves it alone as long as recording, parameters, code and the other
+    results are the same; any other state is started anew, as ids depend on all frames before.
 
     `topics` are names of `OUTPUTS` to record, and with `copy` those of the recording as well; see
     `DepthBag` for where the images are. With `terrain` terrain and height of every frame are

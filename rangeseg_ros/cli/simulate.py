@@ -155,9 +155,8 @@ def terrain(
                                1 cm), stairs
     OUTPUT/camera.yaml         intrinsics
 
-    The camera is 0.3 to 1.6 m high, and looks down by 0 to 60 degrees.
-    Another width keeps the horizontal field of view. `rangeseg evaluate OUTPUT` compares classes
-    of pixels with the truth.
+    The camera is 0.3 to 1.6 m high, and looks down by 0 to 60 degrees. Another width keeps the
+    horizontal field of view. `rangeseg evaluate OUTPUT` compares classes of pixels with the truth.
     """
     names = [kind] if kind else list(HARD if hard else KINDS)
     numbers = range(seed, seed + scenes)

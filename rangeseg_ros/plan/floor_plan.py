@@ -175,10 +175,9 @@ def make_plan(
     """Turn the planes of a map, in a frame of that name, and points (N, 3) of frames into a plan.
 
     `stairs` are those that frames show, with the poses of these, `stood` (F, 3) where the ground
-    was below the camera, NaN where nobody told.
-    What is higher above the ground than the headroom, metres, is not in the way; `resolution`,
-    metres, is the side of the cells of the grid. Of the parameters, `role_tolerance`, `role_area`,
-    `role_height` and `obstacle_height` count.
+    was below the camera, NaN where nobody told. What is higher above the ground than the headroom,
+    metres, is not in the way; `resolution`, metres, is the side of the cells of the grid. Of the
+    parameters, `role_tolerance`, `role_area`, `role_height` and `obstacle_height` count.
     """
     tolerance = np.radians(config.role_tolerance)
     motion = _upright(up)

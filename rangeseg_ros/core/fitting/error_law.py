@@ -100,9 +100,11 @@ def fit_law(
     spread = quantile(np.abs(ratio - quantile(ratio, 0.5)), 0.5) / _MEDIAN
     law = law._replace(error=float(spread / (2 * len(shown) ** 0.5)))
     tilt, deviance = _scale_term(strata.slope, shown, known)
-    if _advantage(deviance, _deviance(known, shown), shown) < _SIGNIFICANT:
-        return law
-    return law._replace(tilt=tilt)
+    # F of the tilt. Edges leave more than chance: what is left of a perfect fit tells by how much
+    # (quasi-likelihood; Wedderburn 1974). Two strata tell nothing.
+    explained, left = _deviance(known, shown) - deviance, deviance - _deviance(shown, shown)
+    significance = explained * max(len(shown) - 2, 0) / max(left, 1e-12)
+    return law if significance < _SIGNIFICANT else law._replace(tilt=tilt)
 
 
 @njit(cache=True, nogil=True)
@@ -129,13 +131,3 @@ def _scale_term(
 def _deviance(explained: NDArray[np.float64], shown: NDArray[np.float64]) -> float:
     """How unlikely variances (S,) are where such (S,) are expected, but for a constant."""
     return float((np.log(explained) + shown / explained).sum())
-
-
-def _advantage(likely: float, unlikely: float, shown: NDArray[np.float64]) -> float:
-    """F of a term by which variances (S,) have one deviance and not the other.
-
-    Edges leave more than chance: what is left of a perfect fit tells by how much (quasi-
-    likelihood; Wedderburn 1974). 0 where too few tell.
-    """
-    left = likely - _deviance(shown, shown)
-    return (unlikely - likely) * max(len(shown) - 2, 0) / max(left, 1e-12)

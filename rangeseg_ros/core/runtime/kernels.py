@@ -11,16 +11,24 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
 from numba.core import event
+from numba.np import linalg
 
 T = TypeVar('T')
 
 _PACKAGE = f'{Path(__file__).parents[2].name}.'
 _ahead: Callable[..., None] | None = None
 _inside = ContextVar('inside', default=False)
+
+# With the first kernel, numba looks for SciPy's linear algebra: 14 MB that none here calls. Now it
+# is imported for those that do.
+ensure_blas, linalg.ensure_blas = linalg.ensure_blas, lambda: None
+import_module('numba.np.arraymath')
+linalg.ensure_blas = ensure_blas
 
 
 class NotCompiledError(Exception):

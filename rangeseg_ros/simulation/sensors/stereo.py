@@ -7,8 +7,7 @@ like blobs of the window's size. What is modelled, in pixels of disparity d = f 
   maker's figure is 0.05 to 0.1 [1]_. Residuals of real planes are alike by 0.97, 0.94, 0.88, 0.7
   and 0.4 at 1, 2, 4, 8 and 16 pixels, which takes blobs of two sizes; and blobs stretch along
   lines of equal disparity, because the error depends on the fraction of a pixel at which a
-  texture is matched (subpixel linearity [2]_). Here the error is a random field of the position
-  and of d.
+  texture is matched (subpixel linearity [2]_). Here it is a random field of the position and d.
 * A smooth distortion of the calibration, fixed for a sensor: a bowl and waves, at most about
   0.005 1/m.
 * Disparity comes in 1/32 pixels, depth in millimetres [3]_.
