@@ -137,8 +137,7 @@ def test_opencv_sees_the_rays_at_their_pixels(tmp_path, model, d):
         zero = np.zeros(3)
         points = cv2.projectPoints(rays, zero, zero, np.eye(3), np.array(d))[0][:, 0]
     columns, rows = camera.matrix[:2] @ np.column_stack([points, np.ones(len(points))]).T
-    expected = np.indices((240, 320)).reshape(2, -1)
-    np.testing.assert_allclose([rows, columns], expected, atol=1e-4)
+    np.testing.assert_allclose([rows, columns], np.indices((240, 320)).reshape(2, -1), atol=1e-4)
 
 
 @pytest.mark.parametrize(('model', 'd'), LENSES)

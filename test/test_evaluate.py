@@ -105,12 +105,12 @@ def test_picture_colours(simulated):
 def test_annotated_folders(tmp_path):
     depth, truth = depth_and_truth()
     truth[:, 90:] = 65535
-    for name in ('a', 'b'):
+    for name in ('a', 'b/c', 'b_c'):
         write_image(tmp_path / name / 'depth.png', depth)
         write_image(tmp_path / name / 'truth.png', truth)
         (tmp_path / name / 'camera.txt').write_text('90 90 47.5 35.5\n')
     cases = find_cases(tmp_path)
-    assert [case.name for case in cases] == ['a', 'b']
+    assert [case.name for case in cases] == ['a', 'b_c', 'b_c_2']
     sample = cases[0].load()
     assert sample.image.camera == CAMERA
     np.testing.assert_array_equal(sample.truth.labels, np.where(truth == 65535, 0, truth))
@@ -256,8 +256,7 @@ def test_tables_and_plots(tmp_path, monkeypatch, name, count):
     monkeypatch.syspath_prepend(str(ROOT / 'docs'))
     experiments = importlib.import_module('experiments')
     monkeypatch.setattr(experiments, 'LAMBDAS', (20.0, 85.0, 150.0))
-    folder = segcomp_set(tmp_path / 'abw')
-    words = [name, folder, '--output', tmp_path / 'out', '--jobs', 1]
+    words = [name, segcomp_set(tmp_path / 'abw'), '--output', tmp_path / 'out', '--jobs', 1]
     monkeypatch.setattr(sys, 'argv', ['experiments.py', *map(str, words)])
     experiments.main()
     assert len((tmp_path / f'out/{name}.csv').read_text().splitlines()) == 1 + count

@@ -36,21 +36,22 @@ def test_a_landing_whose_edge_is_out_of_view_is_no_ground(depth, seed):
     assert 'stated height is 0.80 m' in terrain.stand.reasons[0]
 
 
-@pytest.mark.parametrize('offset', [0.0, 0.02])
-def test_the_ground_continued_errs_as_least_squares_say(offset):
-    random, sd = np.random.default_rng(0), 0.003
+@pytest.mark.parametrize(('offset', 'sd'), [(0.0, 0.003), (0.02, 0.003), (0.02, 0.3)])
+def test_the_ground_continued_errs_as_least_squares_say(offset, sd):
+    random, steepest = np.random.default_rng(0), Config().steepest
     x, y = random.uniform((1, -1), (2, 1), (400, 2)).T
     h = offset + 0.03 * x - 0.01 * y + np.tile([0.002, -0.002], 200)
     seen = continued(np.stack([h, x, y]), np.full(400, sd**2), 0.01, Config())
-    design = np.stack([np.ones(400), x, y], axis=1)
-    plane, square, *_ = np.linalg.lstsq(design, h, rcond=None)
-    assert seen.plane == pytest.approx(plane, abs=2e-4)
-    # As if four cells that err alike were one. What they are off their plane goes on, from the
-    # hundredth part of them that is nearest, over the longest way.
-    start = np.sort(np.hypot(x, y))[4]
-    bent = (1 + 2 * start / 3.2) * np.sqrt(square[0] / 400)
-    known = 4 * sd**2 * np.linalg.inv(design.T @ design)[0, 0]
-    assert seen.error == pytest.approx(np.sqrt(0.01**2 + known + bent**2), rel=1e-3)
+    # As if four cells that err alike were one, and level to within half of the steepest slope.
+    design = np.stack([np.ones(400), x, y], axis=1) / (2 * sd)
+    design = np.concatenate([design, np.diag([1e-3, 2 / steepest, 2 / steepest])])
+    plane = np.linalg.lstsq(design, np.append(h / (2 * sd), np.zeros(3)), rcond=None)[0]
+    assert seen.plane == pytest.approx(plane, abs=1e-9)
+    # What they are off it goes on, from the nearest hundredth of them on, over the longest way.
+    start, off = np.sort(np.hypot(x, y))[4], h - 2 * sd * design[:400] @ plane
+    bent = (1 + 2 * start / 3.2) * np.sqrt((off**2).mean())
+    known = np.linalg.inv(design.T @ design)[0, 0]
+    assert seen.error == pytest.approx(np.sqrt(0.01**2 + known + bent**2), rel=1e-6)
     a, step = seen.plane[0], Config().least_step
     same = (1 - STEPS) * norm.pdf(a, scale=seen.error)
     tails = norm.sf(step, a, seen.error) + norm.cdf(-step, a, seen.error)

@@ -93,7 +93,7 @@ def test_figures_are_of_the_best_assignment_and_pooled_over_images():
 
 
 def test_angle_errors_of_correct_pairs():
-    normals = {5: (0, 0, -1), 6: (0, -1, 0), 7: (0, np.sin(0.1), -np.cos(0.1))}
+    normals = {5: (0, 0, -1), 6: (0, -1, 0), 7: (0, np.sin(0.1), np.cos(0.1))}
     matches = {10: 5, 11: 6, 12: 7}
     # 5-6 is 90 degrees; 5-7 is 0.1 rad; 13 has no match. 174 degrees and 6 degrees are one angle
     # between planes.

@@ -39,8 +39,7 @@ def test_camera_honours_binning_and_region(make):
 
 
 def test_camera_is_the_same_object_while_nothing_changes():
-    first = camera_from_message(camera_info())
-    assert camera_from_message(camera_info()) is first
+    assert camera_from_message(camera_info()) is camera_from_message(camera_info())
     p = np.array([400.0, 0, 300, 0, 0, 400, 200] + [0] * 5)
     assert camera_from_message(camera_info(p=p)) == Camera(640, 480, 400, 400, 300, 200)
 

@@ -33,8 +33,7 @@ def test_normal_of_an_exact_plane(normal, method, reach):
     found = method(image, reach)
     defined = np.isfinite(found[..., 0])
     assert defined.any() and (defined[8:-8, 8:-8].all() or not image.valid.all())
-    angle = np.degrees(np.arccos(np.clip(found[defined] @ normal, -1, 1)))
-    assert angle.max() < 0.1
+    assert np.arccos(np.clip(found[defined] @ normal, -1, 1)).max() < np.radians(0.1)
     np.testing.assert_allclose(np.linalg.norm(found[defined], axis=1), 1, atol=1e-5)
 
 

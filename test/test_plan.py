@@ -199,8 +199,7 @@ def test_right_angles_are_exact_only_where_the_covariance_allows_it():
         plane(3, turned(25.0), (-2, 0, 1), one),
         plane(4, turned(24.0), (-3, 0, 1), 10 * one),
     ]
-    joint = block_diag(*(wall.covariance for wall in walls))
-    squared = square_up(walls, joint, np.radians(10))
+    squared = square_up(walls, block_diag(*(w.covariance for w in walls)), np.radians(10))
     assert [s.exact for s in squared] == ['square', 'square', 'plumb', 'square']
     assert abs(squared[0].normal @ squared[1].normal) < 1e-12
     assert abs(np.cross(squared[0].normal, squared[3].normal)).max() < 1e-12
