@@ -161,6 +161,10 @@ MECHANISMS = (
                side, *rest: regions.repeat(side, 0).repeat(side, 1)[
                    : image.shape[0], : image.shape[1]] * image.valid}),
     Mechanism('curved regions told', 'by_planes/posterior.py', {'plane_probability': 0.0}),
+    Mechanism('small blocks tell the bends of planes', 'by_planes/posterior.py:_probability',
+              {'by_planes.method.plane_probabilities':
+               lambda original: lambda fits, *rest: original(
+                   fits._replace(sensor=fits.sensor._replace(unbent=1.0)), *rest)}),
     Mechanism('facets of curved surfaces told', 'by_planes/posterior.py:_evidence,_solution',
               {'by_planes.method.plane_probabilities': _given(1, np.zeros((0, 2), np.uint16))}),
     Mechanism('method normals', ' '.join(f'by_normals/{name}.py' for name in _NORMALS),

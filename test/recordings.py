@@ -29,8 +29,7 @@ def stamp_of(number):
 
 def depth_images(count, height=48, width=64):
     """Different, incompressible images: (count, H, W) uint16."""
-    noise = np.random.default_rng(0)
-    return noise.integers(0, 5000, (count, height, width)).astype(np.uint16)
+    return np.random.default_rng(0).integers(0, 5000, (count, height, width)).astype(np.uint16)
 
 
 class Recording:

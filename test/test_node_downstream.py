@@ -53,8 +53,7 @@ def test_ids_outlive_a_change_of_parameters_and_end_with_time_running_back(bench
     # From the next frame on the smaller plane is too small, and one frame later it is not.
     small, larger = sorted(before, key=lambda role: before[role]['count'])
     # By more than the few pixels that the labelling wins or loses with the parameter.
-    least = int(1.2 * before[small]['count'])
-    bench.set_parameters(min_pixels=least)
+    bench.set_parameters(min_pixels=int(1.2 * before[small]['count']))
     assert ids_of(planes_of(bench)) == {larger: before[larger]['id']}
     bench.set_parameters(min_pixels=0)
     after = planes_of(bench)

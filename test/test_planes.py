@@ -266,8 +266,7 @@ def test_sums_over_cells_are_those_over_pixels(kind, x, y, width, height, radius
     ratio = np.linalg.eigvals(np.linalg.solve(told, true))
     # Errors are alike all over a cell, of which a strip of eight pixels has two across: there
     # they are said to turn the plane by more than they do.
-    most = 1.15 if height > 8 else 1.8
-    assert ratio.real.min() > 0.85 and ratio.real.max() < most
+    assert ratio.real.min() > 0.85 and ratio.real.max() < (1.15 if height > 8 else 1.8)
     assert np.linalg.matrix_rank(plane.covariance, tol=1e-9 * np.trace(plane.covariance)) <= 3
 
 

@@ -59,6 +59,11 @@ def test_planes_that_the_sensor_bends_are_planes_and_cylinders_none(seed):
     assert (probabilities(inverse, regions, seed, times=16)[1:] > 0.5).all()
     for inverse in (cylinder(0.3), cylinder(0.5)):
         assert probabilities(inverse, inverse > 0, seed)[1] < 0.3
+    # Small blocks show a part of the distortion: it is as much, or surfaces bend the large ones.
+    fits, half = fitted(inverse, inverse > 0), SENSOR.distortion / 2
+    parts = SENSOR, SENSOR._replace(unbent=0.25), SENSOR._replace(distortion=half)
+    found = [plane_probabilities(fits._replace(sensor=s), NO_PAIRS, 0.5)[1] for s in parts]
+    assert found[2] < found[1] < found[0]
 
 
 @pytest.mark.parametrize('bend', [0.08, 0.2])

@@ -36,8 +36,7 @@ CORNER = np.array([(0, -0.8, -0.6), (-0.8, 0.36, -0.48), (0.8, 0.36, -0.48)])
 
 def corner():
     """Depth in metres of a floor and two walls."""
-    inverse = (CAMERA.rays.astype(float) @ CORNER.T / (-1.0, -1.4, -1.2)).max(axis=2)
-    return 1 / inverse
+    return 1 / (CAMERA.rays.astype(float) @ CORNER.T / (-1.0, -1.4, -1.2)).max(axis=2)
 
 
 def segment(depth, config=NORMALS, camera=CAMERA):

@@ -174,8 +174,8 @@ def test_the_stronger_planes_bend_the_more_distortion_is_measured(bend):
     assert 0.5 * bend < sensor.distortion < 1.5 * bend
 
 
-@pytest.mark.parametrize(('bend', 'width'), [(0.5, 16), (0.7, 8)])
-def test_what_bends_by_more_than_the_prior_allows_is_more_than_one_surface(bend, width):
+@pytest.mark.parametrize(('bend', 'width', 'unbent'), [(0.5, 16, 1 / 16), (0.7, 8, 1)])
+def test_what_bends_by_more_than_the_prior_allows_is_more_than_one_surface(bend, width, unbent):
     """Bowls: over a width w, squares of pixels differ from a plane by w^2 / 5, as planes do."""
     row = np.tile(np.arange(-32, 32) ** 2, 10)
     noise = np.random.default_rng(0).normal(0, 1e-4, CAMERA.shape)
@@ -184,6 +184,7 @@ def test_what_bends_by_more_than_the_prior_allows_is_more_than_one_surface(bend,
     sensor = measured_sensor(image, Blocks.of(image), STATED._replace(distortion=3e-4), (0, 0))
     found = np.hypot(sensor.distortion, sensor.range_distortion)
     assert found == pytest.approx(3e-4 * bend * width**2 / 5, rel=0.1)
+    assert sensor.unbent == pytest.approx(unbent, rel=0.1)
 
 
 @pytest.mark.parametrize('seed', range(3))

@@ -10,8 +10,7 @@ from typing import Generic, TypeVar
 
 Item = TypeVar('Item')
 
-# Largest number of waiting items: enough for transforms that always come late, and few enough for
-# the memory.
+# Most items that wait: enough for transforms that always come late, few enough for the memory.
 _CAPACITY = 12
 
 

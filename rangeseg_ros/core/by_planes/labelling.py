@@ -38,8 +38,7 @@ def refine(
     the errors of the image.
     """
     models = Models.of(moments, sensor.distortion_pixels)
-    # Windows as wide as the distortion tell the shifts: where it changes, larger ones tell
-    # another's.
+    # Windows as wide as the distortion tell the shifts; larger ones tell those of other places.
     around = int(sensor.distortion_length / NODE - 1) // 2
     local = shifts(surfaces, blocks, models.theta, _DOMAIN, around, sensor.agreement)
     models = models._replace(shifts=local)

@@ -3,8 +3,8 @@
 What a quadratic explains of the residuals of a plane, its bend, has three terms. Noise, the smooth
 distortion of the sensor and the bend of the surface itself make it, and each term is Gaussian with
 the sum of their variances. The last is log-normal; the posterior compares planes with curved
-surfaces, the likelihood of each integrated over it (Gauss-Hermite quadrature). Regions that touch
-and follow one quadratic are judged together, too.
+surfaces, the likelihood of each integrated over it (Gauss-Hermite quadrature) and over what makes
+large blocks bend. Regions that touch and follow one quadratic are judged together, too.
 """
 
 from __future__ import annotations
@@ -109,12 +109,15 @@ def _probability(
         return prior
     # Noise as the region itself shows it: at a grazing angle it is more than the sensor's.
     noise = alike * max((square - linear - bend) / size, 1.0)
-    around = max(sensor.distortion_length**2, 1.0)
-    distortion = ratio * distortion_share(size, around) * size / 3
+    distortion = ratio * distortion_share(size, max(sensor.distortion_length**2, 1.0)) * size / 3
     # Sum of squares, for each of the three terms, of a bend as large as the region is wide.
     width = _area(total) * size / (3 * scale**2)
-    plane = prior * _likelihood(bend, noise, distortion, width, _PLANE)
-    curved = (1 - prior) * _likelihood(bend, noise, distortion, width, _CURVED)
+    plane = curved = 0.0
+    # Large blocks bend more because the sensor bends planes smoothly, or because surfaces bend.
+    for part in (1.0, sensor.unbent):
+        known = noise + part * distortion
+        plane += prior * _likelihood(bend, known, width, _PLANE)
+        curved += (1 - prior) * _likelihood(bend, known, width, _CURVED)
     return plane / (plane + curved) if plane + curved > 0 else 0.0
 
 
@@ -256,13 +259,11 @@ def _area(total: Floats) -> float:
 
 
 @njit(cache=True)
-def _likelihood(
-    bend: float, noise: float, distortion: float, width: float, surface: tuple[float, float]
-) -> float:
+def _likelihood(bend: float, known: float, width: float, surface: tuple[float, float]) -> float:
     """Density of three squared Gaussian terms that sum to `bend`, but for a common factor."""
     total = 0.0
     for a in range(len(_NODES)):
         own = surface[0] * np.exp(surface[1] * _NODES[a])
-        variance = noise + distortion + width * own * own
+        variance = known + width * own * own
         total += _WEIGHTS[a] * variance**-1.5 * np.exp(-bend / (2 * variance))
     return total

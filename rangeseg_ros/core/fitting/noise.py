@@ -45,8 +45,7 @@ _EXACT = 1e-4
 _WIDEST = 8 * BLOCK
 # Widths of kernels that are told apart, pixels.
 _WIDTHS = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
-# Rows that tell the quantisation by, and the quantile of steps that is one quantum where there is
-# one.
+# Rows that tell the quantisation, and the quantile of their steps that is one quantum if any is.
 _ROWS, _SMALLEST = 20, 0.1
 # Pairs of neighbours that are not the same, at least: a quantile of fewer says nothing.
 _PAIRS = 40
@@ -86,7 +85,7 @@ def measured_sensor(
     found = _over_scales(image.rays, blocks, coarse, noise, least, prior)
     if found is None:
         return prior
-    within, between, filled, distortion = found
+    within, between, filled, distortion, unbent = found
     total, white, width = _random(within, between, filled)
     # Blocks hide a part of the noise, and never show more than there is.
     return prior._replace(
@@ -97,6 +96,7 @@ def measured_sensor(
         correlation=width,
         distortion=max(float(np.sqrt(distortion.constant)), rounding),
         range_distortion=max(float(np.sqrt(distortion.quartic)), range_rounding),
+        unbent=unbent,
         quantum=quantum,
         range_quantum=range_quantum,
         noise_error=noise.error,
@@ -111,12 +111,13 @@ def _over_scales(
     noise: Law,
     least: Law,
     prior: SensorModel,
-) -> tuple[list[float], float, float, Law] | None:
+) -> tuple[list[float], float, float, Law, float] | None:
     """What blocks of 4, 8, 16, ... pixels show, as long as there are enough of them.
 
     V(4), V(8), ... relative to `noise`, what 8 pixels show; M(8) relative to it; the measured
-    share of most blocks; the largest distortion of any scale. None where too few are flat. Noise
-    is the `least` at least; what bends by more than the `prior` allows is more than one surface.
+    share of most blocks; the largest distortion of any scale, and what share of it the smallest
+    shows. None where too few are flat. Noise is the `least` at least; what bends by more than the
+    `prior` allows is more than one surface.
     """
     level = noise.variances(coarse).repeat(2, axis=0).repeat(2, axis=1)
     level = level[: len(blocks.squared), : blocks.squared.shape[1]]
@@ -131,7 +132,7 @@ def _over_scales(
     # What is new in every pixel shows in the smallest blocks, but for what numbers are rounded by.
     shown = noise.times(within[0])
     shown = shown._replace(constant=max(shown.constant, least.constant))
-    between, filled, distortion, most = 1.0, 1.0, Law(0.0, 0.0), 0.0
+    between, filled, distortion, typical = 1.0, 1.0, Law(0.0, 0.0), list[float]()
     side, larger, bend, ranges = 2 * BLOCK, coarse, noise, strata.squared
     while side <= _WIDEST:
         whole = sum_of_four(flat) == 4
@@ -151,16 +152,21 @@ def _over_scales(
         bent = np.maximum(strata.medians(excess), FLOOR)
         bend = fit_law(strata, bent, strata.medians(expected), bend)
         # M(s) = v + D^2 n / 8, with n pixels in each of the four.
-        typical = 8 / pixels * float(quantile(bend.facing(ranges), 0.5))
-        if typical > most:
-            most, distortion = typical, bend.times(8 / pixels)
+        typical.append(8 / pixels * float(quantile(bend.facing(ranges), 0.5)))
+        if typical[-1] == max(typical):
+            distortion = bend.times(8 / pixels)
         # What one surface leaves where the sensor errs by as much as the prior allows. No less: of
         # a bent one, only what happens to be flat would be left to tell the distortion.
         allowed = OUTLIER**2 * systematic_variance(prior, larger.squared) * pixels / 8
         flat = whole & (excess < _BENT * (expected + allowed))
         side *= 2
         blocks, larger = larger, larger.merged(rays, side)
-    return (within, between, filled, distortion) if len(within) > 1 else None
+    if not typical:
+        return None
+    rounding = float(quantile(least.facing(ranges), 0.5))
+    unbent = max(typical[0], rounding) / max(*typical, rounding)
+    # Less of a difference is chance.
+    return within, between, filled, distortion, unbent if CLEARLY * unbent < 1 else 1.0
 
 
 def _some(used: NDArray[np.intp], most: int) -> NDArray[np.intp]:

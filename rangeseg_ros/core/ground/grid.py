@@ -18,8 +18,7 @@ from rangeseg_ros.core.ground.terrain import CellTerrain, Terrain
 from rangeseg_ros.core.rotations import quaternions
 from rangeseg_ros.core.significance import OUTLIER
 
-# Log-odds that a sight of danger adds, that one of ground takes away, and their bounds: those of
-# OctoMap.
+# Log-odds that a sight of danger adds, that one of ground takes away, and their bounds (OctoMap).
 _HIT, _MISS, _BOUNDS = 0.85, 0.4, (-2.0, 3.5)
 
 

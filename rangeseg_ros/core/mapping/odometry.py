@@ -51,8 +51,7 @@ from rangeseg_ros.core.tracking.tracker import NOMINAL, PERSISTENCE
 # of how it errs, as small regions are seldom what they seem.
 _PLANES = 8
 _ROUNDS = 4
-# Errors of the pose, of the velocity and of the pose before come first in the state, then three of
-# each plane.
+# Errors of pose, velocity and the pose before come first in the state, then three of each plane.
 _CAMERA = 18
 _POSES = np.r_[:6, 12:18]
 _NO_EDGES = JumpPoints(np.zeros((0, 3)), 0.0)

@@ -32,6 +32,7 @@ class SensorModel(NamedTuple):
     distortion_length: float  # width of the Gaussian it is smoothed with at most, pixels
     # Random error of a pixel's direction, pixels: what surfaces at grazing angles are noisier by.
     direction_noise: float = 0.0
+    unbent: float = 1.0  # share of the distortion's variance in small blocks, which bend least
     quantum: float = 0.0  # step that the inverse range is rounded to, 0 for none
     range_quantum: float = 0.0
     # Standard errors of what was measured, as shares of it; 0 where they are not known.
