@@ -165,8 +165,7 @@ def test_pixels_beside_borders_take_the_label_of_the_lowest_cost(side):
 def test_borders_are_those_of_pixels():
     """A crease along odd columns and a card along odd rows, neither on a border of bins."""
     rows, columns = np.indices(CAMERA.shape)
-    at = (300.5 - CAMERA.cx) / CAMERA.fx
-    right = WALL + np.array([0.5, 0, -0.5 * at])
+    right = WALL + 0.5 * np.array([1, 0, (CAMERA.cx - 300.5) / CAMERA.fx])
     truth = np.where(columns > 300, 1, 2)
     inverse = np.where(columns > 300, CAMERA.rays @ right, CAMERA.rays @ WALL)
     card = (rows >= 101) & (rows < 200) & (columns >= 51) & (columns < 150)

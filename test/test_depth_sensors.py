@@ -44,8 +44,7 @@ def block_deviations(depth, labels, size):
     label = blocks(labels)
     flat = (label.min(1) == label.max(1)) & (label[:, 0] > 0)
     plane = np.stack([np.ones(size * size), *np.indices((size, size)).reshape(2, -1)], axis=1)
-    squares = np.linalg.lstsq(plane, inverse[flat].T, rcond=None)[1]
-    return np.sqrt(squares / (size * size - 3))
+    return np.sqrt(np.linalg.lstsq(plane, inverse[flat].T, rcond=None)[1] / (size * size - 3))
 
 
 # Medians over the blocks of 4, 8, 16 and 32 pixels on the planes of real frames: Kinect (six

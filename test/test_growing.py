@@ -32,8 +32,7 @@ def grown(inverse, noise=NOISE, seed=0, least=1, **sensor):
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
     edges = grid_of(image, plane_deviation(image, 0.0065))
     model = SensorModel.from_config(Config(pixel_noise=0.0, **sensor))
-    area = image.pixel_area
-    view = View(image, image, Blocks.of(image), edges, model, least, area, True)
+    view = View(image, image, Blocks.of(image), edges, model, least, image.pixel_area, True)
     nodes = Nodes.of(view)
     return join_surfaces(*find_patches(nodes, model), nodes, view, SMOOTHNESS)
 

@@ -106,7 +106,7 @@ def test_bytes_of_markers_are_those_of_the_message(drawn):
         assert (read.pose.position.z, read.scale.y, read.color.b) == (3.0, 0.2, 0.75)
         turn = read.pose.orientation
         assert (turn.x, turn.y, turn.z, turn.w) == (0, 0, 0, 1) and not read.frame_locked
-        assert read.header == header()
+        assert read.header == header() and read.lifetime.sec == read.lifetime.nanosec == 0
 
 
 @pytest.mark.parametrize('frame', ['map', ''])
