@@ -60,8 +60,7 @@ def test_size_and_camera_are_checked():
 def test_segmenter_does_not_forget_the_map(tmp_path):
     write_distortion(tmp_path / 'map.tiff', DistortionMap(smooth_map()))
     config = Config(distortion_map=str(tmp_path / 'map.tiff'), min_pixels=50)
-    seen = (1 / (WALL + smooth_map())).astype(np.float32)
-    image = RangeImage.from_depth(seen, CAMERA)
+    image = RangeImage.from_depth((1 / (WALL + smooth_map())).astype(np.float32), CAMERA)
     with pytest.raises(RangeImageError, match=r'corrected\(image, config\)'):
         Segmenter(config).segment(image)
     (plane,) = Segmenter(config).segment(corrected(image, config)).planes

@@ -35,8 +35,7 @@ def test_a_recording_without_its_end_gives_the_frames_before(tmp_path, share):
 
 @pytest.mark.parametrize('storage', tuple(SUFFIXES))
 def test_damage_in_the_middle_never_escapes_as_another_error(tmp_path, storage):
-    images = depth_images(20)
-    file = record(tmp_path / f'bag{SUFFIXES[storage]}', storage, images)
+    file = record(tmp_path / f'bag{SUFFIXES[storage]}', storage, depth_images(20))
     whole = file.read_bytes()
     noise = np.random.default_rng(1)
     for _ in range(60):

@@ -76,8 +76,7 @@ def test_what_falls_to_the_side_by_20_degrees_is_no_ground(yaw):
     level = prism(np.array([(-0.2, -4), (8, -4), (8, 0), (-0.2, 0)]), 20, turn, (0, 0, 0))
     fall = -7.8 * np.tan(np.radians(20))
     side = prism(np.array([(-8, -9), (-0.2, -9), (-0.2, 0), (-8, fall)]), 20, turn, (0, 0, 0))
-    pieces = Piece(level, GROUND), Piece(side, DROP, 1.0)
-    terrain, frame = judged(pieces, 28, ABOVE, yaw=yaw)
+    terrain, frame = judged((Piece(level, GROUND), Piece(side, DROP, 1.0)), 28, ABOVE, yaw=yaw)
     assert share(terrain.classes, frame, DROP, GROUND) < 0.01
     assert yaw or share(terrain.classes, frame, GROUND, GROUND) > 0.97
 

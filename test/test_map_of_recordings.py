@@ -27,8 +27,7 @@ OPTICAL = Rotation.from_euler('y', 35, degrees=True) * Rotation.from_matrix(OPTI
 def depth(k):
     """Of a wall at x = WALL and the ground at z = 0, STEP nearer to the wall every time."""
     ahead, _, up = np.moveaxis(CAMERA.rays @ OPTICAL.as_matrix().T, -1, 0)
-    inverse = np.maximum(-up / ABOVE, ahead / (WALL - STEP * k))
-    return np.round(1000 / inverse).astype(np.uint16)
+    return np.round(1000 / np.maximum(-up / ABOVE, ahead / (WALL - STEP * k))).astype(np.uint16)
 
 
 @pytest.mark.parametrize(

@@ -153,8 +153,7 @@ def test_node_and_replay_place_the_same_planes_whatever_becomes_of_tf(tmp_path, 
         told = f'{outcome.mapped} planes in odom'
         bench.status(lambda status: values_of(status).get('map from') == told)
         bench.status(lambda status: 'contradict' in values_of(status).get('poses from', ''))
-    kinds = {name: OUTPUTS[name].kind for name in topics}
-    assert_replayed(bench, tmp_path, kinds, len(stamps))
+    assert_replayed(bench, tmp_path, {n: OUTPUTS[n].kind for n in topics}, len(stamps))
 
 
 def test_without_an_up_there_is_no_terrain(tf_messages):

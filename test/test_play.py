@@ -69,8 +69,8 @@ for _ in range(20):
 time.sleep(0.5)
 """
     monkeypatch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', os.fspath(PROFILE))
-    camera = subprocess.Popen([sys.executable, '-c', publisher])
     with Bench(stall_timeout=3600.0) as bench, bench.listening('labels'):
+        camera = subprocess.Popen([sys.executable, '-c', publisher])
         monkeypatch.delenv('FASTRTPS_DEFAULT_PROFILES_FILE')
         bench.until(lambda: camera.poll() is not None)
         # Images without camera_info are received and go no further.

@@ -136,8 +136,7 @@ def test_colours_can_be_told_apart():
     palette = colours(range(1, 49))
     # CIE L*a*b*: 2.3 is a just noticeable difference.
     lab = cv2.cvtColor(palette[None] / np.float32(255), cv2.COLOR_RGB2LAB)[0]
-    distance = np.linalg.norm(lab[:, None] - lab, axis=2)[np.triu_indices(48, 1)]
-    assert distance.min() > 5 * 2.3
+    assert np.linalg.norm(lab[:, None] - lab, axis=2)[np.triu_indices(48, 1)].min() > 5 * 2.3
     assert np.hypot(lab[:, 1], lab[:, 2]).min() > 5 * 2.3  # nor taken for grey
     np.testing.assert_array_equal(colours([5, 9, 49]), palette[[4, 8, 0]])
     assert palette[0].argmax() == 2, 'blue'
