@@ -114,4 +114,4 @@ $(VENV)/writers: $(VENV)/installed
 	touch $@
 
 clean:
-	rm -rf $(VENV) .venv-oldest demo site build install log dist *.egg-info .coverage*
+	rm -rf $(VENV) .venv-oldest .venv-newest demo site build install log dist *.egg-info .coverage*
