@@ -6,11 +6,11 @@ from clouds import cloud_of
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.by_planes.borders import with_sharp_borders
-from rangeseg_ros.core.by_planes.patches import NODE
 from rangeseg_ros.core.by_planes.plane_energy import CAP, NO_PLANE, Models
 from rangeseg_ros.core.by_planes.shifts import Shifts
 from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.sensing.binning import STEPS, Bins, bin_side, step_within
+from rangeseg_ros.core.sensing.blocks import NODE
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.evaluation.label_files import as_truth
 from rangeseg_ros.simulation.fields import smooth_field

@@ -25,7 +25,7 @@ from rangeseg_ros.core.runtime.kernels import with_kernels
 from rangeseg_ros.core.runtime.threads import Task
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.binning import Bins, bin_side
-from rangeseg_ros.core.sensing.blocks import Blocks
+from rangeseg_ros.core.sensing.blocks import NODE, Blocks
 from rangeseg_ros.core.sensing.bridges import bridge_holes
 from rangeseg_ros.core.sensing.encoding import decoded, encoding
 from rangeseg_ros.core.sensing.enlargement import Cells, enlargement
@@ -120,37 +120,35 @@ class Segmenter:
         side = bin_side(image.shape, config.work_budget) if config.method == 'planes' else 1
         view, sensor, jumps = _preprocessed(image, config, side, watch)
         labelling: by_planes.Labelling | by_normals.Labelling
-        curved: NDArray[np.uint16] | None = None
         if config.method == 'planes':
             labelling = by_planes.segment(view, config, watch.lap)
-            valid = labelling.labels > 0
+            valid, errors = labelling.labels > 0, view.sensor
         else:
             labelling = by_normals.segment(view.whole, view.grid, config, watch.lap)
-            valid = view.whole.valid
+            # They know no noise: their regions spill by more than a precise sensor errs.
+            valid, errors = view.whole.valid, SensorModel.from_config(config, image.shape)
         regions = plane_regions(labelling.labels, valid, view.grid, view.least)
         # Parts of a plane that holes cut, or that have either of two directions it lies between.
         regions, pairs = unite_regions(regions, view, config.plane_smoothness)
         pixels: Task[NDArray[np.uint16]] | None = None
-        if isinstance(labelling, by_planes.Labelling):
-            if side > 1:
-                given = regions, labelling.labels, labelling.models, image, side, sensor
-                pixels = Task(with_sharp_borders, *given, config.plane_smoothness * sensor.patch)
-            flat, probability, fits = by_planes.flat_regions(regions, pairs, view, config)
-            numbers, curved = numbers_of(flat), relabel(regions, numbers_of(~flat))
-        else:
-            # Its labels know no noise: their regions spill by more than a precise sensor errs.
-            stated = SensorModel.from_config(config, image.shape)
-            fits = Fits.of(regions, view.image, stated, view.blocks)
-            probability = plane_probabilities(fits, pairs, config.plane_prior)
-            numbers = np.arange(len(probability), dtype=np.uint16)
+        if isinstance(labelling, by_planes.Labelling) and side > 1:
+            given = regions, labelling.labels, labelling.models, image, side, sensor
+            pixels = Task(with_sharp_borders, *given, config.plane_smoothness * sensor.patch)
+        fits = Fits.of(regions, view.image, errors, view.blocks)
+        roots = Task(fits.roots)
+        probability = plane_probabilities(fits, pairs, config.plane_prior)
+        # Of directions, all regions are planes.
+        flat = (probability >= config.plane_probability) | (config.method == 'normals')
+        flat[0] = True
+        numbers, curved = numbers_of(flat), relabel(regions, numbers_of(~flat))
+        fits = fits.without(~flat)
         watch.lap('regions')
-        errors = sensor if pixels else fits.sensor
-        numbered = relabel(regions, numbers)
-        planes = describe_regions(numbered, view.whole, fits, errors, probability)
         # Bridged pixels were not measured; some regions have no plane, or one without an end.
-        known = fits.farthest() > 0
-        labels = pixels.result() if pixels else regions * view.image.valid
-        labels = relabel(labels, known[numbers] * numbers)
+        names = (fits.farthest() > 0)[numbers] * numbers
+        found = Task(lambda: relabel(pixels.result() if pixels else regions * image.valid, names))
+        described = fits, roots.result()[flat], sensor if pixels else errors, probability[flat]
+        planes = describe_regions(relabel(regions, numbers), view.whole, *described)
+        labels = found.result()
         result = Segmentation(
             labels,
             planes,
@@ -198,14 +196,17 @@ def _preprocessed(
     excess = bins.noise_of_pixels(sensor)
     if side > 1:
         image = bins.of_one_surface(steps.pixels * np.float32(excess**0.5))
-        blocks = Blocks.of(image)
     # Planes are fitted to what was measured; where they end is found with small holes bridged,
     # which bins of several pixels do not have.
     whole = bridge_holes(image, steps.windows, steps.slopes) if side == 1 else image
+    nodes = Task(Blocks.of, whole, NODE)
+    if side > 1:
+        blocks = Blocks.of(image)
     jumps = jump_edges(whole, config.jump_edges, steps.windows, steps.slopes, steps.pixels)
     grid = grid_of(whole, jumps)
     watch.lap('edges')
-    view = View(image, whole, blocks, grid, sensor, least, bins.area, identified)
+    known = grid, sensor, least, bins.area, identified
+    view = View(image, whole, blocks, nodes.result(), *known)
     return view, sensor.of_pixels(side, excess), jumps
 
 

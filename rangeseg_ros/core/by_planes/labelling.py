@@ -6,7 +6,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.patches import NODE
 from rangeseg_ros.core.by_planes.plane_energy import (
     LEAST_GAIN,
     NO_PLANE,
@@ -17,6 +16,7 @@ from rangeseg_ros.core.by_planes.plane_energy import (
 from rangeseg_ros.core.by_planes.shifts import shifts
 from rangeseg_ros.core.graphcut.expansion import GridLabelling, band, beyond, expand, fronts
 from rangeseg_ros.core.runtime.threads import run_halves
+from rangeseg_ros.core.sensing.blocks import NODE
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # Pixels from a boundary to cut anew: so far may that of blocks lie from that of pixels.

@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.by_planes.labelling import refine
 from rangeseg_ros.core.by_planes.patches import Nodes, find_patches
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, costs
-from rangeseg_ros.core.by_planes.posterior import plane_probabilities
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.graphcut.expansion import energy
 from rangeseg_ros.core.sensing.grid import View
 
@@ -49,17 +47,3 @@ def segment(view: View, config: Config, lap: Callable[[str], None]) -> Labelling
     labels, models = refine(problem, surface, nodes.moments, moments, sensor)
     lap('labels')
     return Labelling(labels.reshape(whole.shape), problem, models)
-
-
-def flat_regions(
-    regions: NDArray[np.uint16], pairs: NDArray[np.uint16], view: View, config: Config
-) -> tuple[NDArray[np.bool_], NDArray[np.float64], Fits]:
-    """Which of the regions 0...M are 0 or planes, with `plane_probability` at least.
-
-    And the probabilities and the fits of these. `pairs` (E, 2) of regions touch.
-    """
-    fits = Fits.of(regions, view.image, view.sensor, view.blocks)
-    probability = plane_probabilities(fits, pairs, config.plane_prior)
-    flat = probability >= config.plane_probability
-    flat[0] = True
-    return flat, probability[flat], fits.without(~flat)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.region_graph import find_roots, renumbered, singles
 from rangeseg_ros.core.runtime.threads import map_halves
-from rangeseg_ros.core.sensing.blocks import Blocks
+from rangeseg_ros.core.sensing.blocks import NODE
 from rangeseg_ros.core.sensing.grid import View
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, SLOPE, common_residual, fit
 from rangeseg_ros.core.sensing.sensor import (
@@ -21,8 +21,6 @@ from rangeseg_ros.core.sensing.sensor import (
 )
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 
-NODE = 2
-"""Rows and columns of a block: the least that holds a plane."""
 # Measurements of a block, those of bridged holes included, and without these: a plane has three.
 _LEAST = 3
 # Chi-squared of the three degrees of freedom of a plane.
@@ -60,7 +58,7 @@ class Nodes(NamedTuple):
     @classmethod
     def of(cls, view: View) -> Nodes:
         """Those of an image, holes bridged: a row of pixels alone determines no plane."""
-        blocks, sensor = Blocks.of(view.whole, NODE), view.sensor
+        blocks, sensor = view.nodes, view.sensor
         kept = blocks.moments[..., COUNT] >= _LEAST
         kept[: view.whole.shape[0] // NODE, : view.whole.shape[1] // NODE] &= ~_crossed(view)
         count = kept * blocks.moments[..., COUNT]

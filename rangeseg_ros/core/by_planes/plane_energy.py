@@ -8,9 +8,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.patches import NODE
 from rangeseg_ros.core.by_planes.shifts import Shifts, shift_at
 from rangeseg_ros.core.graphcut.expansion import link_costs
+from rangeseg_ros.core.sensing.blocks import NODE
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, SLOPE, add_pixel, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.patches import NODE, Nodes
+from rangeseg_ros.core.by_planes.patches import Nodes
 from rangeseg_ros.core.by_planes.plane_energy import region_moments
 from rangeseg_ros.core.by_planes.posterior import PLANE_BEND
 from rangeseg_ros.core.by_planes.region_graph import (
@@ -25,6 +25,7 @@ from rangeseg_ros.core.by_planes.region_graph import (
     singles,
 )
 from rangeseg_ros.core.regions import by_falling_size, relabel
+from rangeseg_ros.core.sensing.blocks import NODE
 from rangeseg_ros.core.sensing.grid import View
 from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, SIZE, common_residual, fit_all
 from rangeseg_ros.core.sensing.sensor import distortion_share

@@ -12,7 +12,7 @@ from rangeseg_ros.core.description.shapes import Outline, RegionShape, Shape, tr
 from rangeseg_ros.core.fitting.coplanar import common_surfaces
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER
-from rangeseg_ros.core.fitting.uncertainty import covariance_roots, plane_jacobians, squares
+from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, squares
 from rangeseg_ros.core.rotations import quaternions
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -169,19 +169,20 @@ def describe_regions(
     labels: NDArray[np.uint16],
     image: RangeImage,
     fits: Fits,
+    root: NDArray[np.float64],
     sensor: SensorModel,
     probability: NDArray[np.float64] | None = None,
 ) -> list[Plane]:
     """Planes of the regions 1...M of `labels` (H, W), but of those whose pixels determine none.
 
-    `probability` (M + 1,) is that of the regions to be planes, 1 where it is not given. `sensor`
-    is that of the pixels, of which those of the image may be means.
+    `root` (M + 1, 3, 3) is `fits.roots()`, `probability` (M + 1,) that of the regions to be
+    planes, 1 where it is not given. `sensor` is that of the pixels, of which those of the image
+    may be means.
     """
     theta = fits.theta
     probability = np.ones(len(theta)) if probability is None else probability
     if not theta.any():
         return []
-    root = covariance_roots(fits.sums, fits.level, fits.inverses(), fits.sensor)
     normal, distance, centroid, rms, confidence = _described(fits, sensor)
     covariance = squares(plane_jacobians(normal, distance) @ root)
     if image.place.any():

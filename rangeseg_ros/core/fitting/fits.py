@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER, RegionSums, fit_sums, sum_regions
-from rangeseg_ros.core.fitting.uncertainty import levels
+from rangeseg_ros.core.fitting.uncertainty import covariance_roots, levels
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.moments import COUNT, cofactors
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -65,13 +65,13 @@ class Fits(NamedTuple):
         np.minimum.at(least, self.sums.owners, self.level)
         return least
 
-    def inverses(self) -> NDArray[np.float64]:
-        """Inverses (M + 1, 3, 3) of the sums of w r r^T; zeros where there is no plane."""
+    def roots(self) -> NDArray[np.float64]:
+        """Roots (M + 1, 3, 3) of the covariances of the planes, zeros where there is none."""
         known: NDArray[np.bool_] = np.asarray(self.theta.any(axis=1))
         *entries, determinant = cofactors(*self.total[:, :6].T)
         inverse = np.stack(entries, axis=1)[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]]
         inverse = np.where(known[:, None], inverse, 0) / np.where(known, determinant, 1)[:, None]
-        return inverse.reshape(-1, 3, 3)
+        return covariance_roots(self.sums, self.level, inverse.reshape(-1, 3, 3), self.sensor)
 
 
 def _total_least_squares(

@@ -22,6 +22,8 @@ from rangeseg_ros.core.sensing.moments import (
 )
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
+NODE = 2
+"""Rows and columns of the smallest block that holds a plane."""
 BLOCK = 4
 """Rows and columns of a block: the least that tells the noise from a plane through it, with 13
 degrees of freedom; it finds faces 10 pixels wide."""

@@ -31,14 +31,15 @@ class Grid(NamedTuple):
 class View(NamedTuple):
     """A range image, as it was measured and with holes bridged (`whole`, which `grid` is of).
 
-    Or its bins. With its blocks of 4 x 4 pixels, its errors, the pixels of the smallest plane
-    (`least`), the `area` of a pixel at inverse range 1, m^2, and whether the errors are known: not
-    where they were to be measured and the image says too little.
+    Or its bins. With its blocks of 4 x 4 pixels, those of 2 x 2 of `whole` (`nodes`), its errors,
+    the pixels of the smallest plane (`least`), the `area` of a pixel at inverse range 1, m^2, and
+    whether the errors are known: not where they were to be measured and the image says too little.
     """
 
     image: RangeImage
     whole: RangeImage
     blocks: Blocks
+    nodes: Blocks
     grid: Grid
     sensor: SensorModel
     least: int
