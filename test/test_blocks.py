@@ -5,7 +5,7 @@ import pytest
 
 from rangeseg_ros import Camera, Config, RangeImage
 from rangeseg_ros.core.by_planes.patches import Nodes
-from rangeseg_ros.core.sensing.blocks import NODE, Blocks
+from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.grid import Grid, View, grid_of
 from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, SIZE, fit_all
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -25,8 +25,7 @@ def grid(height, width, seed=0):
 def nodes_of(inverse, rays, edges, **sensor):
     """Blocks of 2 x 2 pixels that surfaces are grown from."""
     image, model = RangeImage(rays, inverse), SensorModel.from_config(Config(**sensor))
-    blocks = Blocks.of(image), Blocks.of(image, NODE)
-    return Nodes.of(View(image, image, *blocks, edges, model, 1, 0.0, True))
+    return Nodes.of(View(image, image, Blocks.of(image), edges, model, 1, 0.0, True))
 
 
 @pytest.mark.parametrize('hole', [(2, 2), (3, 2), (2, 3), np.s_[4], np.s_[:4, 4]])

@@ -14,7 +14,7 @@ from rangeseg_ros.core.by_planes.shifts import Shifts, shift_at
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.graphcut.expansion import GridLabelling, energy, fronts, minimise
 from rangeseg_ros.core.regions import connected_components
-from rangeseg_ros.core.sensing.blocks import NODE, Blocks
+from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.grid import Grid, View, grid_of
 from rangeseg_ros.core.sensing.moments import RATIO
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -148,7 +148,7 @@ def test_blocks_without_a_surface_begin_with_the_best_around_them():
     problem, models, labels = random_case(0, 2 * BLOCK, 4 * BLOCK)
     surfaces = np.array([[1, 0, 3, 2], [1, 0, 3, 2]], np.int32)
     labels, data = labels.ravel(), np.zeros(labels.size, np.float32)
-    refinement._label_blocks(surfaces, labels, data, problem, models)
+    refinement._label_blocks(0, 2, surfaces, labels, data, problem, models)
     cost = unary(problem, models)
     best = np.where(cost[1] < cost[3], 1, 3) * (np.minimum(cost[1], cost[3]) < cost[0])
     expected = surfaces.repeat(BLOCK, 0).repeat(BLOCK, 1)
@@ -175,8 +175,7 @@ def test_the_energy_is_nearly_that_of_expansions_to_all_pixels():
     image = RangeImage.from_depth(frame.depth, frame.camera)
     sensor = SensorModel.from_config(Config(pixel_noise=0.0))
     edges = grid_of(image)
-    blocks = Blocks.of(image), Blocks.of(image, NODE)
-    view = View(image, image, *blocks, edges, sensor, 1, image.pixel_area, True)
+    view = View(image, image, Blocks.of(image), edges, sensor, 1, image.pixel_area, True)
     nodes = Nodes.of(view)
     surface, moments = join_surfaces(*find_patches(nodes, sensor), nodes, view, LAMBDA)
     problem = Problem.of(image, sensor, edges, LAMBDA)

@@ -34,6 +34,9 @@ from rangeseg_ros.core.sensing.jump_edges import jump_edges
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
+# What is begun of an image: its bins, and blocks of these.
+Begun = Task[tuple[Bins, Blocks]]
+
 
 class Stopwatch:
     """Times the stages of a run; `laps` are milliseconds per stage."""
@@ -89,6 +92,8 @@ class Segmenter:
             )
         if config.mask and image.body is None:
             raise RangeImageError('mask is not applied yet: segment corrected(image, config)')
+        # Begun before it is known whether the values are those of depth.
+        begun = Task(_binned, image, self._side(image))
         if (q := encoding(image)) is not None:
             depth = decoded(image, q)
             result = self._undone(depth, enlargement(depth))
@@ -96,13 +101,15 @@ class Segmenter:
             return replace(
                 result, image=image, values='picture' if q else 'disparity', survey=None
             )
-        return self._undone(image, enlargement(image))
+        return self._undone(image, enlargement(image), begun)
 
-    def _undone(self, image: RangeImage, cells: Cells | None) -> Segmentation:
+    def _undone(
+        self, image: RangeImage, cells: Cells | None, begun: Begun | None = None
+    ) -> Segmentation:
         """Segment an image, of which a measurement fills several pixels, `cells`, or one."""
         config = self.config
         if cells is None:
-            result = self._find_planes(image)
+            result = self._find_planes(image, begun)
             return replace(result, survey=Survey.of(image, result.sensor, config))
         result = self._find_planes(cells.reduced(image))
         survey = replace(Survey.of(image, result.sensor, config), cells=cells)
@@ -111,14 +118,19 @@ class Segmenter:
         sensor = result.sensor.every(1 / cells.factor)
         return replace(result.of_pixels(labels, image, squares), survey=survey, sensor=sensor)
 
-    def _find_planes(self, image: RangeImage) -> Segmentation:
+    def _side(self, image: RangeImage) -> int:
+        """Pixels along the side of a bin: directions are told from pixels."""
+        planes = self.config.method == 'planes'
+        return bin_side(image.shape, self.config.work_budget) if planes else 1
+
+    def _find_planes(self, image: RangeImage, begun: Begun | None = None) -> Segmentation:
         """Planes of the bins of an image, and labels of its pixels."""
         config, watch = self.config, Stopwatch()
+        side = self._side(image)
         if config.dithering > 0:
-            image = image.dithered(config.dithering, config.seed)
-        # Directions are told from pixels.
-        side = bin_side(image.shape, config.work_budget) if config.method == 'planes' else 1
-        view, sensor, jumps = _preprocessed(image, config, side, watch)
+            image, begun = image.dithered(config.dithering, config.seed), None
+        bins, blocks = begun.result() if begun else _binned(image, side)
+        view, sensor, jumps = _preprocessed(image, config, bins, blocks, watch)
         labelling: by_planes.Labelling | by_normals.Labelling
         if config.method == 'planes':
             labelling = by_planes.segment(view, config, watch.lap)
@@ -169,17 +181,24 @@ class Segmenter:
         return result
 
 
+def _binned(image: RangeImage, side: int) -> tuple[Bins, Blocks]:
+    """Bins of an image, and blocks of these."""
+    bins = Bins.of(image, side)
+    return bins, Blocks.of(bins.means)
+
+
 def _preprocessed(
-    image: RangeImage, config: Config, side: int, watch: Stopwatch
+    image: RangeImage, config: Config, bins: Bins, blocks: Blocks, watch: Stopwatch
 ) -> tuple[View, SensorModel, GridEdges | None]:
     """What is known of an image's bins before planes are looked for.
 
     And the errors of its pixels, and the jump edges between bins.
     """
+    side, planes = bins.side, config.method == 'planes'
+    nodes = Task(Blocks.of, bins.means, NODE) if planes else None
     least = -(-least_pixels(config.min_pixels, image.shape) // side**2)
     stated = SensorModel.from_config(config, image.shape).binned(side)
-    bins = Bins.of(image, side)
-    blocks, sensor = Blocks.of(bins.means), stated
+    sensor = stated
     if config.sensor_model == 'measured':
         sensor = measured_sensor(bins.means, blocks, stated, quantisation(image.inverse))
     identified = config.sensor_model != 'measured' or sensor is not stated
@@ -187,7 +206,7 @@ def _preprocessed(
     # Method normals tells parallel surfaces apart by jump edges alone, so that one too many on
     # a surface seen at a grazing angle costs it less than one too few.
     grazing = sensor
-    if config.method == 'normals':
+    if not planes:
         grazing = sensor._replace(direction_noise=0.0)
     steps = jump_steps(blocks, grazing)
     if config.edge_step > 0:
@@ -196,17 +215,18 @@ def _preprocessed(
     excess = bins.noise_of_pixels(sensor)
     if side > 1:
         image = bins.of_one_surface(steps.pixels * np.float32(excess**0.5))
+    blocks = blocks.updated(bins.means, image)
     # Planes are fitted to what was measured; where they end is found with small holes bridged,
     # which bins of several pixels do not have.
     whole = bridge_holes(image, steps.windows, steps.slopes) if side == 1 else image
-    nodes = Task(Blocks.of, whole, NODE)
-    if side > 1:
-        blocks = Blocks.of(image)
+    if nodes:
+        nodes = Task(nodes.result().updated, bins.means, whole, NODE)
     jumps = jump_edges(whole, config.jump_edges, steps.windows, steps.slopes, steps.pixels)
     grid = grid_of(whole, jumps)
     watch.lap('edges')
-    known = grid, sensor, least, bins.area, identified
-    view = View(image, whole, blocks, nodes.result(), *known)
+    view = View(image, whole, blocks, grid, sensor, least, bins.area, identified)
+    if nodes:
+        view = view._replace(nodes=nodes.result())
     return view, sensor.of_pixels(side, excess), jumps
 
 

@@ -15,7 +15,7 @@ from rangeseg_ros.core.by_planes.plane_energy import (
 )
 from rangeseg_ros.core.by_planes.shifts import shifts
 from rangeseg_ros.core.graphcut.expansion import GridLabelling, band, beyond, expand, fronts
-from rangeseg_ros.core.runtime.threads import run_halves
+from rangeseg_ros.core.runtime.threads import map_halves, run_halves
 from rangeseg_ros.core.sensing.blocks import NODE
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -45,7 +45,7 @@ def refine(
     labels = np.empty(len(problem.inverse), np.int32)
     # What labels cost is worked out where it is asked for.
     data = np.full(len(labels), np.nan, np.float32)
-    _label_blocks(surfaces, labels, data, problem, models)
+    map_halves(_label_blocks, len(surfaces), surfaces, labels, data, problem, models)
     labelling = GridLabelling.of(labels, data, problem.links, problem.width)
     height = len(labels) // problem.width
     run_halves(_expand_near, height, labelling, problem, models)
@@ -54,20 +54,22 @@ def refine(
 
 @njit(cache=True, nogil=True)
 def _label_blocks(
+    first: int,
+    after: int,
     surfaces: NDArray[np.int32],
     labels: NDArray[np.int32],
     data: NDArray[np.float32],
     problem: Problem,
     models: Models,
 ) -> None:
-    """Label the pixels of blocks (rows, columns) with the surfaces of these.
+    """Label the pixels of rows first...after of blocks with the surfaces of these.
 
     The pixels of a block without a surface, most of which a border crosses, get the label of the
     lowest cost among those of the blocks around it: expansions then have less to change.
     """
     width = problem.width
     around = np.empty(9, np.int32)
-    for bi in range(len(surfaces)):
+    for bi in range(first, after):
         for bj in range(surfaces.shape[1]):
             own = surfaces[bi, bj]
             count = 0

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.region_graph import find_roots, renumbered, singles
 from rangeseg_ros.core.runtime.threads import map_halves
-from rangeseg_ros.core.sensing.blocks import NODE
-from rangeseg_ros.core.sensing.grid import View
-from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, SLOPE, common_residual, fit
+from rangeseg_ros.core.sensing.blocks import NODE, Blocks
+from rangeseg_ros.core.sensing.grid import Grid, View
+from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, SIZE, SLOPE, common_residual, fit
 from rangeseg_ros.core.sensing.sensor import (
     SensorModel,
     random_variance,
@@ -58,33 +58,56 @@ class Nodes(NamedTuple):
     @classmethod
     def of(cls, view: View) -> Nodes:
         """Those of an image, holes bridged: a row of pixels alone determines no plane."""
-        blocks, sensor = view.nodes, view.sensor
-        kept = blocks.moments[..., COUNT] >= _LEAST
-        kept[: view.whole.shape[0] // NODE, : view.whole.shape[1] // NODE] &= ~_crossed(view)
-        count = kept * blocks.moments[..., COUNT]
-        level = random_variance(sensor, blocks.squared)
-        tilt = tilt_variance(sensor, blocks.slope) / level
-        weight = kept / (level * (1 + tilt))
-        moments = blocks.moments
-        moments *= weight[..., None]
-        moments[..., COUNT] = count
-        moments[..., RATIO] = count * weight * systematic_variance(sensor, blocks.squared)
-        moments[..., SLOPE] = count * tilt
-        # Blocks touch where an edge joins a pixel of one and a pixel of the other.
-        across, down = view.grid.right[:, 1::NODE], view.grid.below[1::NODE]
-        right, below = across[::NODE].copy(), down[:, ::NODE].copy()
-        right[: len(across) // NODE] |= across[1::NODE]
-        below[:, : down.shape[1] // NODE] |= down[:, 1::NODE]
-        return cls(moments, weight * blocks.residual, right, below)
+        blocks = view.nodes or Blocks.of(view.whole, NODE)
+        rows, columns = blocks.squared.shape
+        right = np.zeros((rows, columns - 1), np.bool_)
+        below = np.zeros((rows - 1, columns), np.bool_)
+        given = blocks, view.whole.valid, view.grid, view.sensor
+        map_halves(_weigh, rows, *given, right, below)
+        return cls(blocks.moments, blocks.residual, right, below)
 
 
-def _crossed(view: View) -> NDArray[np.bool_]:
-    """Whether a jump parts two measured pixels of a whole block."""
-    valid, grid = view.whole.valid, view.grid
-    across = valid[:, :-1:NODE] & valid[:, 1::NODE] & ~grid.right[:, ::NODE]
-    down = valid[:-1:NODE] & valid[1::NODE] & ~grid.below[::NODE]
-    crossed: NDArray[np.bool_] = across[:-1:NODE] | across[1::NODE]
-    return crossed | down[:, :-1:NODE] | down[:, 1::NODE]
+@njit(cache=True, nogil=True, error_model='numpy')
+def _weigh(
+    first: int,
+    after: int,
+    blocks: Blocks,
+    valid: NDArray[np.bool_],
+    grid: Grid,
+    sensor: SensorModel,
+    right: NDArray[np.bool_],
+    below: NDArray[np.bool_],
+) -> None:
+    """Weigh moments and residuals of rows first...after of blocks, in place; tell which touch.
+
+    Blocks touch where an edge joins a pixel of one and a pixel of the other. A jump crosses one
+    where it parts two of its measured pixels.
+    """
+    (height, width), columns = valid.shape, blocks.squared.shape[1]
+    for bi in range(first, after):
+        bottom = min((bi + 1) * NODE, height)
+        for bj in range(columns):
+            end, crossed = min((bj + 1) * NODE, width), False
+            for i in range(bi * NODE, bottom):
+                for j in range(bj * NODE, end):
+                    if j + 1 < end:
+                        crossed |= valid[i, j] and valid[i, j + 1] and not grid.right[i, j]
+                    elif j + 1 < width:
+                        right[bi, bj] |= grid.right[i, j]
+                    if i + 1 < bottom:
+                        crossed |= valid[i, j] and valid[i + 1, j] and not grid.below[i, j]
+                    elif i + 1 < height:
+                        below[bi, bj] |= grid.below[i, j]
+            moments, squared = blocks.moments[bi, bj], blocks.squared[bi, bj]
+            count = moments[COUNT] * (moments[COUNT] >= _LEAST and not crossed)
+            level = random_variance(sensor, squared)
+            tilt = tilt_variance(sensor, blocks.slope[bi, bj]) / level
+            weight = (count > 0) / (level * (1 + tilt))
+            for k in range(CHI2 + 1):
+                moments[k] *= weight
+            moments[COUNT], moments[SLOPE] = count, count * tilt
+            moments[RATIO] = count * weight * systematic_variance(sensor, squared)
+            blocks.residual[bi, bj] *= weight
 
 
 def find_patches(

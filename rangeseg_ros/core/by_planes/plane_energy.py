@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.shifts import Shifts, shift_at
 from rangeseg_ros.core.graphcut.expansion import link_costs
+from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import NODE
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, SLOPE, add_pixel, fit_all
@@ -121,20 +122,24 @@ def region_moments(
     labels: NDArray[np.integer], count: int, image: RangeImage, sensor: SensorModel
 ) -> NDArray[np.float64]:
     """Moments (count, 13) of the pixels of each of `count` labels (H, W); zeros for label 0."""
-    return _sum_moments(labels, count, image.inverse, image.rays, sensor)
+    given = labels, count, image.inverse, image.rays, sensor
+    upper, lower = map_halves(_sum_moments, len(labels), *given)
+    return upper + lower
 
 
 @njit(cache=True, nogil=True)
 def _sum_moments(
+    first: int,
+    after: int,
     labels: NDArray[np.integer],
     count: int,
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
     sensor: SensorModel,
 ) -> NDArray[np.float64]:
-    """See `region_moments`."""
+    """Those of rows first...after of pixels."""
     total = np.zeros((count, SIZE))
-    for i in range(len(labels)):
+    for i in range(first, after):
         weight = _weights(inverse[i], sensor)
         for j in range(labels.shape[1]):
             label, y, w = labels[i, j], np.float64(inverse[i, j]), np.float64(weight[j])

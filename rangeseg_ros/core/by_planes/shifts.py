@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.region_sums import find_boxes
+from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import RATIO
 
 
@@ -58,7 +59,7 @@ def shifts(
     end = np.cumsum(extent.prod(axis=1))
     start = end - extent.prod(axis=1)
     local = Shifts(np.hstack([corner, extent]), start, np.zeros(end[-1], np.float32))
-    _find_shifts(local, _inner(surfaces), blocks, theta, around, agreement)
+    map_halves(_find_shifts, len(theta), local, _inner(surfaces), blocks, theta, around, agreement)
     return local
 
 
@@ -83,6 +84,8 @@ def _inner(surfaces: NDArray[np.int32]) -> NDArray[np.int32]:
 
 @njit(cache=True, nogil=True)
 def _find_shifts(
+    first: int,
+    after: int,
     local: Shifts,
     inner: NDArray[np.int32],
     blocks: NDArray[np.float64],
@@ -90,9 +93,9 @@ def _find_shifts(
     around: int,
     agreement: float,
 ) -> None:
-    """Fill in the shifts of planes in their boxes, from sums over windows of blocks."""
+    """Fill in the shifts of planes first...after, from sums over windows of blocks."""
     window = np.empty(3)
-    for k in range(1, len(theta)):
+    for k in range(max(first, 1), after):
         top, left, rows, columns = local.box[k]
         own = local.values[local.start[k] : local.start[k] + rows * columns]
         result = own.reshape(rows, columns)

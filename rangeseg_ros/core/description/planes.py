@@ -89,8 +89,13 @@ class Plane:
 
         As `dataclasses.replace` does it, which takes each field by itself, ten times as long.
         """
-        plane = object.__new__(type(self))
-        vars(plane).update(vars(self), **names)
+        return self._made({**vars(self), **names})
+
+    @classmethod
+    def _made(cls: type[Own], values: dict[str, Any]) -> Own:
+        """A plane with the values of all fields."""
+        plane = object.__new__(cls)
+        vars(plane).update(values)
         return plane
 
     def __repr__(self) -> str:
@@ -207,7 +212,11 @@ def describe_regions(
     place, right = image.place, image.axes[:, 0].copy()
     shapes = [RegionShape(outline, place, right) for outline in outlines]
     columns = known, known, group, *equations, centroid[found], *figures, outlines, shapes
-    return list(map(Plane, *columns))
+    names = [f.name for f in fields(Plane)]
+    return [
+        Plane._made({'role': '', **dict(zip(names, values, strict=False))})
+        for values in zip(*columns, strict=True)
+    ]
 
 
 def _described(fits: Fits, sensor: SensorModel) -> tuple[NDArray[np.float64], ...]:

@@ -67,7 +67,7 @@ class Strata(NamedTuple):
         bounds = np.arange(1, ranges) * slopes * size
         order = np.argpartition(squared, bounds)[: ranges * slopes * size].reshape(ranges, -1)
         inner = np.argpartition(slope[order], np.arange(1, slopes) * size, axis=1)
-        order = np.take_along_axis(order, inner, axis=1).reshape(-1, size)
+        order = order[np.arange(ranges)[:, None], inner].reshape(-1, size)
         medians = quantile(squared[order], 0.5), quantile(slope[order], 0.5)
         return cls(used[order], *medians, slopes)
 

@@ -101,8 +101,9 @@ def sum_regions(
     outliers = left_out[:, COUNT].astype(np.intp)
     measured = total[:, COUNT].astype(np.intp) + outliers
     many = 2 * outliers > measured
-    cells += outside * many[owners, None]
-    total += left_out * many[:, None]
+    if many.any():
+        cells += outside * many[owners, None]
+        total += left_out * many[:, None]
     kept = cells[:, COUNT] > 0
     start = np.searchsorted(np.flatnonzero(kept), layout.start)
     return RegionSums(layout.box, start, cells[kept], measured, outliers), total

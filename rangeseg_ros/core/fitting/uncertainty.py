@@ -60,8 +60,24 @@ def roots(outer: NDArray[np.float64], middle: NDArray[np.float64]) -> NDArray[np
     So no rounding that `outer` magnifies makes a variance negative. What rounding has made of
     directions without variance is left out.
     """
-    values, vectors = np.linalg.eigh(middle)
-    return outer @ (vectors * np.sqrt(np.maximum(values, 0))[:, None])
+    return outer @ _cholesky(middle)
+
+
+@njit(cache=True, nogil=True)
+def _cholesky(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lower triangles L (N, 3, 3) with L L^T the matrices."""
+    factor = np.zeros_like(matrices)
+    for k in range(len(matrices)):
+        for p in range(3):
+            for q in range(p + 1):
+                rest = matrices[k, p, q]
+                for r in range(q):
+                    rest -= factor[k, p, r] * factor[k, q, r]
+                if p == q:
+                    factor[k, p, p] = np.sqrt(max(rest, 0.0))
+                elif factor[k, q, q] > 0:
+                    factor[k, p, q] = rest / factor[k, q, q]
+    return factor
 
 
 def squares(root: NDArray[np.float64]) -> NDArray[np.float64]:

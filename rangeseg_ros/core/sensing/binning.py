@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import VGA
-from rangeseg_ros.core.sensing.blocks import for_pixels
+from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.enlargement import Cells, camera_of_cells
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
@@ -91,23 +91,13 @@ class Bins(NamedTuple):
 
         `steps` are the smallest jumps in blocks of 4 x 4 bins, 1/m.
         """
-        slope = np.float32(_STEEPEST * self.area**0.5)
-        limits = for_pixels(steps, self.means.shape) + slope * self.means.inverse
-        wide = (self.spread >= limits) & self.means.valid
-        values = np.stack([each[wide] for each in _places(self.pixels.inverse, self.side)])
-        known = values > 0
-        # Of two surfaces that are as large, the nearer one.
-        ordered = np.sort(np.where(known, values, np.float32(np.inf)), axis=0)
-        middle = np.take_along_axis(ordered, known.sum(axis=0)[None] // 2, axis=0)
-        kept = known & (np.abs(values - middle) <= limits[wide])
-        inverse, rays = self.means.inverse.copy(), self.means.rays
-        inverse[wide] = _means(values, kept)
-        if self.means.camera is None:
-            rays = rays.copy()
-            for k in range(3):
-                places = _places(self.pixels.rays[..., k], self.side)
-                rays[wide, k] = _means([each[wide] for each in places], kept)
-        return replace(self.means, inverse=inverse, rays=rays)
+        slope, inverse = np.float32(_STEEPEST * self.area**0.5), self.means.inverse.copy()
+        rays, cloud = self.means.rays, self.means.camera is None
+        # Rays of a camera are those of the middles of bins.
+        means = rays.copy() if cloud else np.zeros((0, 0, 3), np.float32)
+        pixels = self.pixels.inverse, self.pixels.rays, self.side
+        _average_near_median(*pixels, self.spread, steps, slope, inverse, means)
+        return replace(self.means, inverse=inverse, rays=means if cloud else rays)
 
 
 @njit(cache=True, nogil=True)
@@ -133,6 +123,54 @@ def _average(
         for j in range(columns):
             means[i, j] = total[j] / max(count[j], 1)
             spread[i, j] = max(most[j] - least[j], np.float32(0))
+
+
+@njit(cache=True, nogil=True)
+def _average_near_median(
+    pixels: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    side: int,
+    spread: NDArray[np.float32],
+    steps: NDArray[np.float32],
+    slope: np.float32,
+    means: NDArray[np.float32],
+    mean_rays: NDArray[np.float32],
+) -> None:
+    """Average the measurements of bins whose `spread` is wide again, near their median alone."""
+    values, total = np.empty(side * side, np.float32), np.empty(4)
+    for i in range(len(means)):
+        least = steps[i // BLOCK].min()
+        for j in range(means.shape[1]):
+            if spread[i, j] < least:  # as of most
+                continue
+            limit = steps[i // BLOCK, j // BLOCK] + slope * means[i, j]
+            if means[i, j] == 0 or spread[i, j] < limit:
+                continue
+            count, kept, middle = 0, 0, np.float32(0)
+            bottom, end = min((i + 1) * side, len(pixels)), min((j + 1) * side, pixels.shape[1])
+            for u in range(i * side, bottom):
+                for v in range(j * side, end):
+                    values[count] = pixels[u, v]
+                    count += pixels[u, v] > 0
+            for a in range(count):
+                below = ties = 0
+                for b in range(count):
+                    below, ties = below + (values[b] < values[a]), ties + (values[b] == values[a])
+                # Of two surfaces that are as large, the nearer one.
+                if below <= count // 2 < below + ties:
+                    middle = values[a]
+            total[:] = 0
+            for u in range(i * side, bottom):
+                for v in range(j * side, end):
+                    if pixels[u, v] > 0 and abs(pixels[u, v] - middle) <= limit:
+                        kept += 1
+                        total[3] += pixels[u, v]
+                        for k in range(3):
+                            total[k] += rays[u, v, k]
+            means[i, j] = total[3] / kept
+            if len(mean_rays) > 0:
+                for k in range(3):
+                    mean_rays[i, j, k] = total[k] / kept
 
 
 def _places(pixels: NDArray, side: int) -> list[NDArray]:

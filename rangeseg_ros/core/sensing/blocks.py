@@ -47,15 +47,21 @@ class Blocks(NamedTuple):
         """Blocks of `size` pixels."""
         height, width = image.shape
         blocks = cls._empty(-(-height // size), -(-width // size))
-        _sum_pixels(image.inverse, image.rays, image.pinhole, size, blocks)
+        whole = 0, 0, *blocks.squared.shape
+        _sum_pixels(image.inverse, image.rays, image.pinhole, size, whole, blocks)
         return blocks
+
+    def updated(self, before: RangeImage, image: RangeImage, size: int = BLOCK) -> Blocks:
+        """They, in place: of an image that differs in a few pixels from the one before."""
+        _update(before.inverse, image.inverse, image.rays, image.pinhole, size, self)
+        return self
 
     def merged(self, rays: NDArray[np.float32], size: int) -> Blocks:
         """Every 2 x 2 of them as one: blocks of `size` pixels of these rays (H, W, 3)."""
         rows, columns = self.squared.shape
         blocks = self._empty((rows + 1) // 2, (columns + 1) // 2)
         blocks.moments[:] = sum_of_four(self.moments)
-        _fit_planes(rays, size, blocks)
+        _fit_planes(rays, size, (0, 0, *blocks.squared.shape), blocks)
         return blocks
 
     @classmethod
@@ -86,13 +92,14 @@ def _sum_pixels(
     rays: NDArray[np.float32],
     pinhole: bool,
     size: int,
+    part: tuple[int, int, int, int],
     blocks: Blocks,
 ) -> None:
-    """Fill in blocks of pixels."""
+    """Fill in blocks of pixels, from a first row and column to those after the last."""
     height, width = inverse.shape
-    moments = blocks.moments
-    for bi in range(moments.shape[0]):
-        for bj in range(moments.shape[1]):
+    moments, (top, begin, bottom, end) = blocks.moments, part
+    for bi in range(top, bottom):
+        for bj in range(begin, end):
             sums, count = NO_PIXEL, 0
             for i in range(bi * size, min((bi + 1) * size, height)):
                 for j in range(bj * size, min((bj + 1) * size, width)):
@@ -105,16 +112,18 @@ def _sum_pixels(
             for k, value in enumerate(sums):
                 moments[bi, bj, k] = value
             moments[bi, bj, COUNT], moments[bi, bj, RATIO], moments[bi, bj, SLOPE] = count, 0, 0
-    _fit_planes(rays, size, blocks)
+    _fit_planes(rays, size, part, blocks)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def _fit_planes(rays: NDArray[np.float32], size: int, blocks: Blocks) -> None:
+def _fit_planes(
+    rays: NDArray[np.float32], size: int, part: tuple[int, int, int, int], blocks: Blocks
+) -> None:
     """Fill in the planes of blocks whose moments are known."""
-    rows, columns = blocks.squared.shape
+    columns, (top, begin, bottom, end) = blocks.squared.shape[1], part
     m = blocks.moments.reshape(-1, SIZE)
-    for bi in range(rows):
-        for bj in range(columns):
+    for bi in range(top, bottom):
+        for bj in range(begin, end):
             k = bi * columns + bj
             x, y, z, left = plane_of(sums_of(m, k))
             count = m[k, COUNT]
@@ -127,6 +136,28 @@ def _fit_planes(rays: NDArray[np.float32], size: int, blocks: Blocks) -> None:
             # Less the variance of the slopes by noise.
             noise = left / max(count - 3, 1.0) * 2 * 12 / (size * size - 1) / max(count, 1.0)
             blocks.slope[bi, bj] = max(slope - noise, 0.0)
+
+
+@njit(cache=True, nogil=True)
+def _update(
+    before: NDArray[np.float32],
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    pinhole: bool,
+    size: int,
+    blocks: Blocks,
+) -> None:
+    """Fill in blocks with pixels that differ from those `before`."""
+    height, width = inverse.shape
+    for bi in range(len(blocks.squared)):
+        for bj in range(blocks.squared.shape[1]):
+            alike = True
+            for i in range(bi * size, min((bi + 1) * size, height)):
+                for j in range(bj * size, min((bj + 1) * size, width)):
+                    alike &= inverse[i, j] == before[i, j]
+            if not alike:
+                part = bi, bj, bi + 1, bj + 1
+                _sum_pixels(inverse, rays, pinhole, size, part, blocks)
 
 
 @njit(cache=True, inline='always')

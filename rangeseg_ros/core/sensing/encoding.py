@@ -11,6 +11,7 @@ from dataclasses import replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import VGA
@@ -23,6 +24,7 @@ from rangeseg_ros.core.significance import CLEARLY, chi2_quantile, quantile
 _SIDE, _SAMPLES = 48, 8
 # Values of q, by quarters of octaves of 1 / (1 - q): farthest over nearest, or its inverse.
 _Q = 1 - 2.0 ** np.arange(3, -4.1, -0.25)
+_ROUNDING = float(np.finfo(np.float32).eps)
 # A disparity has no q to fit: what that explains must be more than chance.
 _CHANCE = chi2_quantile(1) / 2
 # Metres, about what indoor cameras see; for 2 to 4 of them as many planes of pictures are found.
@@ -38,32 +40,20 @@ def encoding(image: RangeImage) -> float | None:
     """
     if image.camera is None:
         return None
-    inverse = _blocks(image.inverse[..., None])
-    known = (inverse > 0).all(axis=(1, 2))
-    if not known.any():
-        return None
-    least = inverse[inverse > 0].min()
+    step = max(round(_SIDE / _SAMPLES * (image.inverse.size / VGA) ** 0.5), 1)
     if image.camera not in _fits:
         # Rays of a very narrow view are all but one, but for the rounding of their squares.
-        rays, precise = _blocks(image.rays), np.finfo(np.float64).eps ** 0.5
+        rays, precise = _blocks(image.rays, step), np.finfo(np.float64).eps ** 0.5
         _fits[image.camera] = rays, np.linalg.pinv(rays, rcond=precise)
-    inverse, rays, fit = (each[known] for each in (inverse, *_fits[image.camera]))
-    # Behind the camera where no plane fits.
-    level = np.maximum(rays @ (fit @ (1 / inverse)), 0.5 / inverse.max(axis=1, keepdims=True))
-    both = np.concatenate([inverse, 1 / level], axis=2)
-    # What planes leave of the values and of the bend.
-    left, bend = np.moveaxis(both - rays @ (fit @ both), 2, 0)
-    square = np.maximum((bend**2).sum(axis=1), 1e-30)
-    share = (left * bend).sum(axis=1) / square
-    noise = ((left - share[:, None] * bend) ** 2).sum(axis=1) / (_SAMPLES**2 - 4)
-    noise += (np.finfo(np.float32).eps * inverse.max(axis=(1, 2))) ** 2
+    least, found = _shares(image.inverse, step, *_fits[image.camera])
+    share, variance, rough, values = found[found[:, 3] > 0].T
+    if not len(share):
+        return None
     # What is rougher than most, as where surfaces meet, is no part of a plane.
-    rough = noise / inverse.max(axis=(1, 2)) ** 2
     flat = rough <= CLEARLY * quantile(rough, 0.5)
-    values = least * (1 / inverse[flat]).mean(axis=(1, 2))
     # Real planes differ by more than their noise tells.
-    share, variance = share[flat], (noise / square)[flat] + SPREAD**2
-    off = np.log1p((share - 1 / (1 - _Q[:, None] * values)) ** 2 / variance)
+    share, variance = share[flat], variance[flat] + SPREAD**2
+    off = np.log1p((share - 1 / (1 - _Q[:, None] * least * values[flat])) ** 2 / variance)
     # Of a curved surface, neighbours tell the same: two blocks count as one.
     odds = (np.log1p(share**2 / variance) - off).sum(axis=1) / 2
     # Only a picture, of 8 bits, has another q.
@@ -85,10 +75,57 @@ def decoded(image: RangeImage, q: float) -> RangeImage:
 _fits: WeakKeyDictionary[Camera, tuple[NDArray[np.float64], ...]] = WeakKeyDictionary()
 
 
-def _blocks(values: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Samples (N, S, K) of values (H, W, K) in blocks."""
-    step = max(round(_SIDE / _SAMPLES * (values[..., 0].size / VGA) ** 0.5), 1)
+def _blocks(values: NDArray[np.float32], step: int) -> NDArray[np.float64]:
+    """Samples (N, S, K) of values (H, W, K) in blocks: every so many pixels."""
     some = values[::step, ::step].astype(np.float64)
     n, (rows, columns) = _SAMPLES, (length // _SAMPLES for length in some.shape[:2])
     blocks = some[: rows * n, : columns * n].reshape(rows, n, columns, n, some.shape[2])
     return blocks.transpose(0, 2, 1, 3, 4).reshape(rows * columns, n * n, some.shape[2])
+
+
+@njit(cache=True, nogil=True)
+def _shares(
+    inverse: NDArray[np.float32], step: int, rays: NDArray[np.float64], fit: NDArray[np.float64]
+) -> tuple[float, NDArray[np.float64]]:
+    """The least inverse range in blocks, and of each its share of the bend (N, 4).
+
+    With its variance by noise, the variance of noise relative to the largest square, and the mean
+    range; zeros of blocks where a sample was not measured.
+    """
+    columns = -(-inverse.shape[1] // step) // _SAMPLES
+    y, bent, fits = np.empty(rays.shape[1]), np.empty(rays.shape[1]), np.empty((3, 3))
+    found, least = np.zeros((len(rays), 4)), np.inf
+    for n in range(len(rays)):
+        top, begin, most, known = n // columns * _SAMPLES, n % columns * _SAMPLES, 0.0, True
+        for k in range(len(y)):
+            y[k] = inverse[(top + k // _SAMPLES) * step, (begin + k % _SAMPLES) * step]
+            known, most = known and y[k] > 0, max(most, y[k])
+            least = min(least, y[k] if y[k] > 0 else np.inf)
+        if not known:
+            continue
+        fits[:], far = 0, 0.0
+        for k in range(len(y)):
+            far += 1 / y[k] / len(y)
+            for c in range(3):
+                fits[0, c] += fit[n, c, k] * y[k]
+                fits[1, c] += fit[n, c, k] / y[k]
+        for k in range(len(y)):
+            # Behind the camera where no plane fits.
+            bent[k] = 1 / max(_along(fits[1], rays[n, k]), 0.5 / most)
+            for c in range(3):
+                fits[2, c] += fit[n, c, k] * bent[k]
+        # What planes leave of the values and of the bend.
+        own = both = square = 0.0
+        for k in range(len(y)):
+            left, bend = y[k] - _along(fits[0], rays[n, k]), bent[k] - _along(fits[2], rays[n, k])
+            own, both, square = own + left * left, both + left * bend, square + bend * bend
+        square = max(square, 1e-30)
+        noise = max(own - both * both / square, 0.0) / (len(y) - 4) + (_ROUNDING * most) ** 2
+        found[n, 0], found[n, 1] = both / square, noise / square
+        found[n, 2], found[n, 3] = noise / (most * most), far
+    return least, found
+
+
+@njit(cache=True, inline='always')
+def _along(theta: NDArray[np.float64], ray: NDArray[np.float64]) -> float:
+    return theta[0] * ray[0] + theta[1] * ray[1] + theta[2] * ray[2]

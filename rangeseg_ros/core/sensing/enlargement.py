@@ -120,8 +120,11 @@ def replication(image: RangeImage) -> Cells | None:
     Columns and rows at which neighbours differ are multiples of the factor apart. At least half of
     the borders must show it: a few edges of an exact scene may lie at multiples by chance.
     """
-    (factor, columns), (other, rows) = _period(image.inverse), _period(image.inverse.T)
-    return Cells(factor, rows, columns) if 0 < factor == other else None
+    factor, columns = _period(image.inverse)
+    if not factor:
+        return None
+    other, rows = _period(image.inverse.T)
+    return Cells(factor, rows, columns) if factor == other else None
 
 
 def _period(lines: NDArray[np.float32]) -> tuple[int, int]:
@@ -181,21 +184,20 @@ def _spectrum(
     differences: NDArray[Any], distance: NDArray[Any], periods: slice
 ) -> NDArray[np.float64]:
     """Amplitude of the size of differences along lines at each period, in standard errors."""
-    size = np.abs(differences)
-    known = np.isfinite(size)
+    size, some = np.abs(differences), slice(None, None, _FEW | 1)
+    known, typical = np.isfinite(size), size.ravel()[some]
     # Of float32, and of sensors whose steps are wide, many are 0.
-    changes = size[known & (size > 1e-5 * distance[:, : size.shape[1]])]
-    columns = np.flatnonzero(known.any(axis=0))
-    waves = _waves(distance.shape[1])[periods, columns]
-    if not len(changes) or len(columns) < 2 * _LARGEST:
+    typical = typical[typical > 1e-5 * distance[:, : size.shape[1]].ravel()[some]]
+    count = known.sum(axis=0)
+    waves = _waves(distance.shape[1])[periods, : len(count)]
+    if not len(typical) or np.count_nonzero(count) < 2 * _LARGEST:
         return np.zeros(len(waves))
     # Edges of objects are no part of it.
-    typical = quantile(changes[::_FEW], 0.5)
-    size = np.where(known, np.minimum(size, 2 * typical), 0)
-    means = size.sum(axis=0, dtype=float)[columns] / known.sum(axis=0)[columns]
-    spread = means.std() * len(columns) ** 0.5
-    sums = np.abs((waves * (means - means.mean())).sum(axis=1))
-    return sums / max(spread, 1e-300)
+    size = np.where(known, np.minimum(size, 2 * quantile(typical, 0.5)), 0)
+    means = size.sum(axis=0, dtype=float) / np.maximum(count, 1)
+    means = np.where(count > 0, means - means[count > 0].mean(), 0)
+    # Not by BLAS, whose threads would take longer.
+    return np.abs((waves * means).sum(axis=1)) / max((means * means).sum() ** 0.5, 1e-300)
 
 
 @lru_cache(maxsize=4)

@@ -31,20 +31,21 @@ class Grid(NamedTuple):
 class View(NamedTuple):
     """A range image, as it was measured and with holes bridged (`whole`, which `grid` is of).
 
-    Or its bins. With its blocks of 4 x 4 pixels, those of 2 x 2 of `whole` (`nodes`), its errors,
-    the pixels of the smallest plane (`least`), the `area` of a pixel at inverse range 1, m^2, and
-    whether the errors are known: not where they were to be measured and the image says too little.
+    Or its bins. With its blocks of 4 x 4 pixels, its errors, the pixels of the smallest plane
+    (`least`), the `area` of a pixel at inverse range 1, m^2, and whether the errors are known: not
+    where they were to be measured and the image says too little. `nodes` are blocks of 2 x 2
+    pixels of `whole`, which growing surfaces takes for itself; None where they are to be made.
     """
 
     image: RangeImage
     whole: RangeImage
     blocks: Blocks
-    nodes: Blocks
     grid: Grid
     sensor: SensorModel
     least: int
     area: float
     identified: bool
+    nodes: Blocks | None = None
 
 
 def grid_of(image: RangeImage, jumps: GridEdges | None = None) -> Grid:
