@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Mask
 from rangeseg_ros.core.description.planes import Plane
 
 _SQUARE = np.ones((3, 3), np.uint8)
@@ -77,7 +78,7 @@ def overlay(
     return picture
 
 
-def borders(labels: NDArray[np.uint16]) -> NDArray[np.bool_]:
+def borders(labels: NDArray[np.uint16]) -> Mask:
     """Pixels whose right or lower neighbour has another label."""
     border = np.zeros(labels.shape, bool)
     border[:, :-1] |= labels[:, :-1] != labels[:, 1:]
@@ -85,7 +86,7 @@ def borders(labels: NDArray[np.uint16]) -> NDArray[np.bool_]:
     return border
 
 
-def _write_id(picture: NDArray[np.uint8], region: NDArray[np.bool_], text: str) -> None:
+def _write_id(picture: NDArray[np.uint8], region: Mask, text: str) -> None:
     """Write `text` where the region is widest, if it is wide enough, inside of the picture.
 
     White, with a black outline; `region` has every second row and column of `picture`.

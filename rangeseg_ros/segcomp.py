@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
@@ -93,7 +94,7 @@ def read_angles(path: str | os.PathLike[str]) -> list[tuple[int, int, float]]:
     return [(_label(a), _label(b), angle) for a, b, angle in _read_rows(path, 3, integers=2)]
 
 
-def read_normals(path: str | os.PathLike[str]) -> dict[int, NDArray[np.float64]]:
+def read_normals(path: str | os.PathLike[str]) -> dict[int, Floats]:
     """Read a `.ms-nor` file: a count, then lines `label nx ny nz`."""
     return {_label(row[0]): np.array(row[1:]) for row in _read_rows(path, 4, integers=1)}
 
@@ -148,7 +149,7 @@ class AbwCalibration:
         """The scanner as a camera: 512 x 512, pixels lower than wide."""
         return Camera(SIZE, SIZE, self.focal, self.focal * self._ASPECT, 255.0, 255.0)
 
-    def depth(self, values: ArrayLike) -> NDArray[np.float64]:
+    def depth(self, values: ArrayLike) -> Floats:
         """Depth in metres of range values; NaN for 0, which is shadow."""
         array = np.asarray(values, dtype=float)
         return np.where(array == 0, np.nan, (array / self.scale + self.offset) * 1e-3)
@@ -178,7 +179,7 @@ _STEP = 0.20236
 _STANDOFF = 830.3
 
 
-def perceptron_points(values: ArrayLike) -> NDArray[np.float64]:
+def perceptron_points(values: ArrayLike) -> Floats:
     """Points (512, 512, 3) of range values (512, 512) of the Perceptron laser scanner, metres.
 
     It has no single centre: its beams leave a rotating mirror and a nodding one. The origin is at

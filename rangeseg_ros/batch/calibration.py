@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Singles
 from rangeseg_ros.core.calibration.calibrate import CalibrationError
 from rangeseg_ros.core.calibration.sightings import Sightings, concatenate, find_sightings
 from rangeseg_ros.core.config import Config
@@ -134,7 +134,7 @@ class Residuals(NamedTuple):
     Residuals (2, H, W), 1/m, NaN where there is no plane; and the numbers of planes.
     """
 
-    images: NDArray[np.float32]
+    images: Singles
     planes: tuple[int, int]
 
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rangeseg_ros.batch.locator import Locator
 from rangeseg_ros.batch.replay import Progress, segment_frames
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.stairs import Stairs
 from rangeseg_ros.core.mapping.adjustment import Adjustment, Solution
@@ -172,9 +172,7 @@ class PlanTask:
         best = max(stretches, key=lambda stretch: stretch.extent)
         return frames, best, warnings + sequence.map.doubts
 
-    def _points(
-        self, frames: list[int], solution: Solution, config: Config
-    ) -> Iterator[NDArray[np.float64]]:
+    def _points(self, frames: list[int], solution: Solution, config: Config) -> Iterator[Floats]:
         """Points of the frames of these numbers, at their poses and without the distortion."""
         sensor = SensorModel.from_config(config)
         poses = dict(zip(frames, solution.poses, strict=True))

@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Indices, Labels, Mask
 from rangeseg_ros.core.config import VGA
 from rangeseg_ros.core.sensing.grid import Grid
 
@@ -18,9 +19,7 @@ def least_pixels(min_pixels: int, shape: tuple[int, int]) -> int:
     return min_pixels or max(round(300 * shape[0] * shape[1] / VGA), 1)
 
 
-def plane_regions(
-    labels: NDArray[np.integer], valid: NDArray[np.bool_], grid: Grid, min_pixels: int
-) -> NDArray[np.uint16]:
+def plane_regions(labels: NDArray[np.integer], valid: Mask, grid: Grid, min_pixels: int) -> Labels:
     """Segmentation (H, W) of a labelling: its components that are large enough for planes.
 
     1...M by falling size, 0 for no plane: pixels that are not valid, and regions of less than
@@ -34,7 +33,7 @@ def plane_regions(
 
 @njit(cache=True, nogil=True)
 def connected_components(
-    labels: NDArray[np.integer], grid: Grid, valid: NDArray[np.bool_]
+    labels: NDArray[np.integer], grid: Grid, valid: Mask
 ) -> NDArray[np.int32]:
     """4-connected components of like labels that cross no disconnected edge.
 
@@ -74,7 +73,7 @@ def connected_components(
 
 
 @njit(cache=True, nogil=True)
-def region_sizes(regions: NDArray[np.integer], count: int) -> NDArray[np.intp]:
+def region_sizes(regions: NDArray[np.integer], count: int) -> Indices:
     """Pixels (count,) of each region 0...count - 1."""
     sizes = np.zeros(count, np.intp)
     for i in range(len(regions)):
@@ -88,13 +87,13 @@ def region_sizes(regions: NDArray[np.integer], count: int) -> NDArray[np.intp]:
     return sizes
 
 
-def numbers_of(kept: NDArray[np.bool_]) -> NDArray[np.uint16]:
+def numbers_of(kept: Mask) -> Labels:
     """New number of each region: 1, 2, ... of those of 1...M that are `kept` (M + 1,), else 0."""
     kept = kept & (np.arange(len(kept)) > 0)
     return np.where(kept, np.cumsum(kept), 0).astype(np.uint16)
 
 
-def by_falling_size(area: NDArray[np.integer]) -> NDArray[np.uint16]:
+def by_falling_size(area: NDArray[np.integer]) -> Labels:
     """New number of each region: 1...M by falling size, 0 for size 0; at most 65535."""
     order = (-area).argsort(kind='stable')[: min(np.count_nonzero(area), 65535)]
     table = np.zeros(len(area), np.uint16)
@@ -102,7 +101,7 @@ def by_falling_size(area: NDArray[np.integer]) -> NDArray[np.uint16]:
     return table
 
 
-def relabel(regions: NDArray[np.integer], table: NDArray[np.uint16]) -> NDArray[np.uint16]:
+def relabel(regions: NDArray[np.integer], table: Labels) -> Labels:
     """Regions (H, W) by another name: `table` (M + 1,) has the new number of each."""
     # No region is beyond the table; without a look for one it takes a third of the time.
     return table.take(regions, mode='clip')

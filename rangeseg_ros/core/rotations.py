@@ -6,10 +6,12 @@ The few forms that the core needs: to import SciPy's takes longer than to segmen
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from rangeseg_ros.core.arrays import Floats
 
 
-def quaternions(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+def quaternions(rotations: Floats) -> Floats:
     """Unit quaternions (..., 4) x, y, z, w, with w >= 0, of rotations (..., 3, 3).
 
     A rotation has all products of two components of its quaternion q: they make up 4 q q^T, of
@@ -29,11 +31,11 @@ def quaternions(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     largest = np.argmax(np.diagonal(products, axis1=-2, axis2=-1), axis=-1)
     row = np.take_along_axis(products, largest[..., None, None], axis=-2)[..., 0, :]
     row /= np.linalg.norm(row, axis=-1, keepdims=True)
-    signed: NDArray[np.float64] = row * np.where(row[..., 3:] < 0, -1.0, 1.0)
+    signed: Floats = row * np.where(row[..., 3:] < 0, -1.0, 1.0)
     return signed
 
 
-def rotation_matrix(quaternion: ArrayLike) -> NDArray[np.float64]:
+def rotation_matrix(quaternion: ArrayLike) -> Floats:
     """Rotation (3, 3) of a unit quaternion x, y, z, w."""
     x, y, z, w = np.asarray(quaternion, np.float64)
     return np.array(
@@ -45,7 +47,7 @@ def rotation_matrix(quaternion: ArrayLike) -> NDArray[np.float64]:
     )
 
 
-def rotation_by(turn: ArrayLike) -> NDArray[np.float64]:
+def rotation_by(turn: ArrayLike) -> Floats:
     """Rotation (3, 3) about the vector `turn` (3,) by its length, radians (Rodrigues)."""
     x, y, z = np.asarray(turn, np.float64)
     angle = np.sqrt(x * x + y * y + z * z)
@@ -53,17 +55,17 @@ def rotation_by(turn: ArrayLike) -> NDArray[np.float64]:
     # sin(a) / a and (1 - cos(a)) / a^2, right for the smallest angles as well.
     first = np.sinc(angle / np.pi)
     second = np.sinc(angle / (2 * np.pi)) ** 2 / 2
-    rotation: NDArray[np.float64] = np.eye(3) + first * cross + second * (cross @ cross)
+    rotation: Floats = np.eye(3) + first * cross + second * (cross @ cross)
     return rotation
 
 
-def turn_between(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+def turn_between(first: Floats, second: Floats) -> Floats:
     """The least rotation (3, 3) that takes a unit vector (3,) to another one, not its opposite."""
     cross = cross_matrix(np.cross(first, second))
     return np.eye(3) + cross + cross @ cross / (1 + first @ second)
 
 
-def cross_matrix(vector: ArrayLike) -> NDArray[np.float64]:
+def cross_matrix(vector: ArrayLike) -> Floats:
     """Matrix (3, 3) of cross products: cross_matrix(a) @ b = a x b."""
     x, y, z = np.asarray(vector, np.float64)
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Labels, Mask, Singles
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.grid import GroundGrid
@@ -36,7 +37,7 @@ class Labelling(Protocol):
     def energy(self) -> float:
         """Value of eq. 5.3."""
 
-    def normals(self) -> NDArray[np.float32] | None:
+    def normals(self) -> Singles | None:
         """Normals (H, W, 3) that the labels stand for; None where the planes have them."""
 
 
@@ -44,12 +45,12 @@ class WorkedOut(NamedTuple):
     """A `Labelling` without the image it is of: what remains of it in a pickle."""
 
     value: float
-    field: NDArray[np.float32] | None
+    field: Singles | None
 
     def energy(self) -> float:
         return self.value
 
-    def normals(self) -> NDArray[np.float32] | None:
+    def normals(self) -> Singles | None:
         return self.field
 
 
@@ -96,7 +97,7 @@ class Segmentation:
         Those of the image: depth, or disparity or picture, whose planes are measured in no unit.
     """
 
-    labels: NDArray[np.uint16]
+    labels: Labels
     planes: list[Plane]
     timings: dict[str, float]
     reason: str
@@ -108,7 +109,7 @@ class Segmentation:
     work_budget: float = 1.0
     image: RangeImage | None = None
     cells: Cells | None = field(default=None, repr=False)
-    curved_regions: NDArray[np.uint16] | None = field(default=None, repr=False)
+    curved_regions: Labels | None = field(default=None, repr=False)
     identified: bool = True
     values: str = 'depth'
 
@@ -165,9 +166,7 @@ class Segmentation:
         doubts = self.identified, self.values
         return judge(self.image, self.labels, thetas, self.curved, *doubts)
 
-    def of_pixels(
-        self, labels: NDArray[np.uint16], image: RangeImage, cells: Cells
-    ) -> Segmentation:
+    def of_pixels(self, labels: Labels, image: RangeImage, cells: Cells) -> Segmentation:
         """The result of the image whose `cells` it is of, with labels (H, W) of its pixels."""
         counts = region_sizes(
             labels, max((plane.label for plane in self.planes), default=0) + 1
@@ -185,7 +184,7 @@ class Segmentation:
         return array if self.cells is None else self.cells.enlarged(array, self.labels.shape)
 
     @property
-    def curved(self) -> NDArray[np.uint16]:
+    def curved(self) -> Labels:
         """(H, W) 1, 2, ... on smooth regions that are less probably planes than
         `plane_probability` asks for, by falling size; 0 elsewhere.
         """
@@ -202,7 +201,7 @@ class Segmentation:
         return tilt_of(self.planes, self.survey.up, *self.upright)
 
     @cached_property
-    def normals(self) -> NDArray[np.float32]:
+    def normals(self) -> Singles:
         """Reconstructed surface normals (thesis 5.11), worked out when read.
 
         (H, W, 3), unit vectors towards the sensor in the frame of the image: with method normals
@@ -219,7 +218,7 @@ class Segmentation:
         return table.take(self.labels, axis=0, mode='clip')
 
     @cached_property
-    def edges(self) -> NDArray[np.bool_]:
+    def edges(self) -> Mask:
         """(H, W) True on either side of a jump edge, worked out when read."""
         if self.jumps is None:
             return np.zeros(self.labels.shape, np.bool_)
@@ -251,7 +250,7 @@ class Segmentation:
         return [replace(seen, edge=seen.edge + place) for seen in stairs_of(self.ground)]
 
     @property
-    def up(self) -> NDArray[np.float64] | None:
+    def up(self) -> Floats | None:
         """(3,) unit vector in the frame of the image; None where no ground was asked for."""
         if self.survey is None:
             return None
@@ -270,7 +269,7 @@ class Segmentation:
         return self.ground.classes
 
     @property
-    def height(self) -> NDArray[np.float32]:
+    def height(self) -> Singles:
         """(H, W) metres along up above the ground; NaN where that is not known."""
         if self.ground is None:
             return np.full(self.labels.shape, np.nan, np.float32)

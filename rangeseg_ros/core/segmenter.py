@@ -6,8 +6,8 @@ import time
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Labels
 from rangeseg_ros.core.by_normals import method as by_normals
 from rangeseg_ros.core.by_planes import method as by_planes
 from rangeseg_ros.core.by_planes.borders import with_sharp_borders
@@ -142,7 +142,7 @@ class Segmenter:
         regions = plane_regions(labelling.labels, valid, view.grid, view.least)
         # Parts of a plane that holes cut, or that have either of two directions it lies between.
         regions, pairs = unite_regions(regions, view, config.plane_smoothness)
-        pixels: Task[NDArray[np.uint16]] | None = None
+        pixels: Task[Labels] | None = None
         if isinstance(labelling, by_planes.Labelling) and side > 1:
             given = regions, labelling.labels, labelling.models, image, side, sensor
             pixels = Task(with_sharp_borders, *given, config.plane_smoothness * sensor.patch)

@@ -6,7 +6,8 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
+
+from rangeseg_ros.core.arrays import Floats
 
 LEVEL = 0.999  # quantile that noise stays below: where it does not, something else is there
 OUTLIER = 4.0  # standard deviations from which an error is no noise: one of 16 000 by chance
@@ -15,7 +16,7 @@ CAUCHY = 2.385  # deviations at which errors count half: 95 % efficient (Holland
 SAMPLES = 12  # that tell three parameters, those of a plane, or a quantile: four for each
 
 
-def quantile(values: NDArray[np.float64], share: float) -> NDArray[np.float64]:
+def quantile(values: Floats, share: float) -> Floats:
     """Of values (..., N), the one (...,) that a share of them is below."""
     rank = int(share * (values.shape[-1] - 1))
     return np.partition(values, rank)[..., rank].copy()

@@ -14,8 +14,8 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.sensing.camera import Camera, CameraError
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.evaluation.label_files import (
@@ -46,7 +46,7 @@ class Sample(NamedTuple):
     image: RangeImage
     truth: Truth
     angles: list[tuple[int, int, float]]
-    planes: dict[int, NDArray[np.float64]]
+    planes: dict[int, Floats]
 
 
 @dataclass(frozen=True)

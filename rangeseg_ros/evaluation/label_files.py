@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Mask
 from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.io.files import natural_order
 from rangeseg_ros.io.images import read_labels
@@ -29,7 +30,7 @@ class Truth(NamedTuple):
     """
 
     labels: NDArray[np.uint16]
-    judged: NDArray[np.bool_] | None
+    judged: Mask | None
     min_pixels: int = 1
 
     def compare(self, labels: NDArray) -> Overlap:
@@ -61,7 +62,7 @@ def read_angles_beside(path: Path) -> list[tuple[int, int, float]]:
     return read_angles(path) if path.exists() else []
 
 
-def read_normals_beside(path: Path) -> dict[int, NDArray[np.float64]]:
+def read_normals_beside(path: Path) -> dict[int, Floats]:
     """Normals of the `.ms-nor` file beside a `.ms-seg`, if there is one."""
     path = path.with_suffix('.ms-nor')
     return read_normals(path) if path.exists() else {}

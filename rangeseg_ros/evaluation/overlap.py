@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment
 
+from rangeseg_ros.core.arrays import Floats
+
 
 class ComparisonError(ValueError):
     """Label images, or a tolerance, that cannot be compared."""
@@ -69,24 +71,24 @@ class Overlap:
         return cls(regions[a], found[b], sizes[a], found_sizes[b], table[np.ix_(a, b)])
 
     @cached_property
-    def of_truth(self) -> NDArray[np.float64]:
+    def of_truth(self) -> Floats:
         """(G, M) share of the truth's region that is in the segmentation's."""
         return self.shared / self.truth_sizes[:, None]
 
     @cached_property
-    def of_labels(self) -> NDArray[np.float64]:
+    def of_labels(self) -> Floats:
         """(G, M) share of the segmentation's region that is in the truth's."""
         return self.shared / self.label_sizes
 
     @cached_property
-    def iou(self) -> NDArray[np.float64]:
+    def iou(self) -> Floats:
         """(G, M) intersection over union."""
         return self.shared / (self.truth_sizes[:, None] + self.label_sizes - self.shared)
 
     @property
-    def best_iou(self) -> NDArray[np.float64]:
+    def best_iou(self) -> Floats:
         """(G,) highest intersection over union of each region of the truth; 0 when untouched."""
-        best: NDArray[np.float64] = self.iou.max(axis=1, initial=0)
+        best: Floats = self.iou.max(axis=1, initial=0)
         return best
 
 

@@ -7,12 +7,14 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rangeseg_ros.core.arrays import Floats
+
 
 def angle_errors(
     angles: Iterable[tuple[int, int, float]],
     normals: Mapping[int, ArrayLike],
     matches: Mapping[int, int],
-) -> NDArray[np.float64]:
+) -> Floats:
     """Errors (N,) of the angles between regions, degrees, where both regions are correct.
 
     `angles` are (label, label, degrees) of the truth, `normals` (3,) those of the segmentation's
@@ -28,7 +30,7 @@ def angle_errors(
 
 def plane_errors(
     truth: Mapping[int, ArrayLike], found: Mapping[int, ArrayLike], matches: Mapping[int, int]
-) -> NDArray[np.float64]:
+) -> Floats:
     """Errors (N, 2) of the planes of correct regions, in the order of `matches`.
 
     Angle between the normals in degrees, and difference of the distances from the origin in

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Singles
 from rangeseg_ros.core.ground.stairs import Stairs
 
 # Pixels from which a tread counts as in sight, and metres that its pixels are off its height.
@@ -28,9 +28,7 @@ class StairsCheck(NamedTuple):
     false: int
 
 
-def check_stairs(
-    row: Mapping[str, str], height: NDArray[np.float32], found: Sequence[Stairs]
-) -> StairsCheck:
+def check_stairs(row: Mapping[str, str], height: Singles, found: Sequence[Stairs]) -> StairsCheck:
     """Compare stairs with those of a row of the table of scenes.
 
     The row has `direction`, `count`, `rise`, `run`, empty without stairs; `height` (H, W) is the

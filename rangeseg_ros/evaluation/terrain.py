@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Mask
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.segmenter import Segmenter
@@ -39,7 +40,7 @@ _DEPTHS = (('depth', 'png'), ('size', 'tiff'), ('crossing', 'tiff'), ('height', 
 
 
 def write_terrains(
-    path: Path, images: Iterable[tuple[str, str, Terrain, tuple[NDArray[np.float64], float]]]
+    path: Path, images: Iterable[tuple[str, str, Terrain, tuple[Floats, float]]]
 ) -> None:
     """Write the CSV of images: name, sensor, scene, and up and height as the robot knows them."""
     rows = []
@@ -62,7 +63,7 @@ class Shares(NamedTuple):
     name: str
     kind: str
     pixels: NDArray[np.int64]
-    obstacles: NDArray[np.float64]
+    obstacles: Floats
     stairs: StairsCheck
     confidence: float = 0.0
     own: bool = False
@@ -130,12 +131,12 @@ def _read_truth(path: Path, shape: tuple[int, int]) -> NDArray[np.uint8]:
 _COLOURS = np.array([[0, 0, 0], [0, 150, 0], [220, 0, 0], [0, 0, 240]], np.uint8)
 
 
-def _near_borders(truth: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def _near_borders(truth: NDArray[np.uint8]) -> Mask:
     """(H, W) whether another judged class is within `MARGIN` pixels."""
     kernel = np.ones((2 * MARGIN + 1, 2 * MARGIN + 1), np.uint8)
     highest = cv2.dilate(truth, kernel)
     lowest = cv2.erode(np.where(truth == UNKNOWN, 255, truth).astype(np.uint8), kernel)
-    result: NDArray[np.bool_] = highest != lowest
+    result: Mask = highest != lowest
     return result
 
 

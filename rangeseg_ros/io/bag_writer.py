@@ -12,6 +12,7 @@ from rosbags import rosbag2
 from rosbags.interfaces import Connection
 from rosbags.typesys import Stores
 
+from rangeseg_ros.core.arrays import Singles
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.rotations import quaternions
 from rangeseg_ros.core.sensing.camera import Camera
@@ -70,7 +71,7 @@ class DepthBagWriter:
     def __exit__(self, *exception: Any) -> None:
         self._files.__exit__(*exception)
 
-    def write(self, depth: NDArray[np.uint16] | NDArray[np.float32], stamp: int) -> None:
+    def write(self, depth: NDArray[np.uint16] | Singles, stamp: int) -> None:
         """Append an image, (H, W) uint16 millimetres or float32 metres, at `stamp` nanoseconds.
 
         BagError: another size or type, or a stamp beyond the 32 bits of ROS 2 for seconds.

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Singles
 from rangeseg_ros.core.sensing.camera import Camera, CameraError
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.extras import import_extra
@@ -123,7 +124,7 @@ def _read_numpy(path: Path, shape: tuple[int, int] | None) -> NDArray:
     return organised(array, shape, path) if array.shape[1:] == (3,) else array
 
 
-def _read_exr(path: Path) -> NDArray[np.float32]:
+def _read_exr(path: Path) -> Singles:
     try:
         channels = import_extra('OpenEXR').File(str(path), separate_channels=True).channels()
     except (RuntimeError, ValueError, OSError):

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageSequence, TiffImagePlugin
 
+from rangeseg_ros.core.arrays import Singles
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.distortion import DistortionError, DistortionMap
 from rangeseg_ros.io.files import replacing
@@ -47,7 +47,7 @@ def read_distortion(path: Path) -> DistortionMap:
         raise DistortionError(f'{path}: not a readable TIFF') from None
 
 
-def _map_of(pages: list[NDArray[np.float32]], about: dict[str, Any]) -> DistortionMap:
+def _map_of(pages: list[Singles], about: dict[str, Any]) -> DistortionMap:
     if len(pages) > 4 or any(page.shape != pages[0].shape for page in pages):
         raise DistortionError('not one to four pages of one size')
     try:
@@ -79,7 +79,7 @@ def write_distortion(path: Path, distortion: DistortionMap) -> None:
         first.save(partial, 'TIFF', save_all=True, append_images=others, tiffinfo=tags)
 
 
-def _page(page: Image.Image) -> NDArray[np.float32]:
+def _page(page: Image.Image) -> Singles:
     if page.mode != 'F':
         raise DistortionError(f'a distortion map is float32 of one channel, not {page.mode}')
     values = np.array(page, np.float32)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Mask
 from rangeseg_ros.io.files import FileError, read_bytes, replacing
 from rangeseg_ros.messages.images import shape_and_pages
 
@@ -38,7 +39,7 @@ def read_labels(path: Path) -> NDArray[np.uint16]:
     return image.astype(np.uint16, copy=False)
 
 
-def read_mask(path: Path) -> NDArray[np.bool_]:
+def read_mask(path: Path) -> Mask:
     """Mask (H, W) of an image of any type: True where a channel is not 0.
 
     Of four channels, the last one is opacity.
@@ -46,7 +47,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     image = _read(path)
     if image.ndim == 2:
         return image != 0
-    mask: NDArray[np.bool_] = (image[..., :3] != 0).any(axis=2)
+    mask: Mask = (image[..., :3] != 0).any(axis=2)
     return mask & (image[..., 3] != 0) if image.shape[2] == 4 else mask
 
 

@@ -6,13 +6,13 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Singles
 from rangeseg_ros.extras import import_extra
 from rangeseg_ros.io.files import FileError, read_bytes
 
 
-def read_pcd(path: Path, *fields: str) -> NDArray[np.float32]:
+def read_pcd(path: Path, *fields: str) -> Singles:
     """Values (H, W, n) of n fields of a PCD file; an unorganised cloud has H = 1.
 
     FileError: it cannot be read, is damaged, or lacks one of the fields.

@@ -12,8 +12,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.meshes import write_mesh
@@ -144,7 +144,7 @@ def write_geojson(path: Path, plan: FloorPlan) -> None:
     path.write_text(json.dumps(collection, indent=1), encoding='utf-8')
 
 
-def _rounded(values: NDArray[np.float64], digits: int = 4) -> Any:
+def _rounded(values: Floats, digits: int = 4) -> Any:
     return np.round(values, digits).tolist()
 
 

@@ -9,8 +9,9 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.sensing.camera import Camera, CameraError, CameraWarning, positive_integer
 from rangeseg_ros.messages.make import CAMERA_INFO, Make
 
@@ -109,7 +110,7 @@ def camera_from_matrices(
 
 def _matrix_in_use(
     k: ArrayLike, p: ArrayLike | None, distorts: bool, raw: bool | None
-) -> tuple[NDArray[np.float64], bool]:
+) -> tuple[Floats, bool]:
     """P of rectified images or K of raw ones, and whether the image is raw."""
     matrix = _matrix('camera matrix K', k, 3)
     projection = None if p is None or raw else _matrix('projection matrix P', p, 4)
@@ -123,7 +124,7 @@ def _matrix_in_use(
     return projection, False
 
 
-def _matrix(name: str, values: ArrayLike, columns: int) -> NDArray[np.float64]:
+def _matrix(name: str, values: ArrayLike, columns: int) -> Floats:
     """Matrix (3, columns) of a calibration, which has zeros below its diagonal."""
     matrix = _numbers(name, values)
     if matrix.size != 3 * columns:
@@ -134,7 +135,7 @@ def _matrix(name: str, values: ArrayLike, columns: int) -> NDArray[np.float64]:
     return matrix
 
 
-def _numbers(name: str, values: ArrayLike) -> NDArray[np.float64]:
+def _numbers(name: str, values: ArrayLike) -> Floats:
     try:
         return np.asarray(values, dtype=float).ravel()
     except (TypeError, ValueError, OverflowError):

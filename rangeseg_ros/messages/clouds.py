@@ -11,6 +11,7 @@ import numpy as np
 from numpy.lib.recfunctions import unstructured_to_structured
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Singles
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.roles import ROLES
 from rangeseg_ros.core.ground.stairs import Stairs
@@ -45,7 +46,7 @@ _STAIRS_TYPE = np.dtype(
 _POINT_FIELD_TYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 
 
-def points_from_message(cloud: Any) -> NDArray[np.float32] | NDArray[np.float64]:
+def points_from_message(cloud: Any) -> Singles | Floats:
     """Points (H, W, 3), metres, of an organised sensor_msgs/PointCloud2; else MessageError."""
     if not cloud.height * cloud.width:
         raise MessageError(f'cloud is empty ({cloud.width}x{cloud.height})')
@@ -126,7 +127,7 @@ def planes_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
     return cloud_message(make, header, np.array(rows, PLANE_TYPE))
 
 
-def points_message(make: Make, header: Any, points: NDArray[np.float32]) -> Any:
+def points_message(make: Make, header: Any, points: Singles) -> Any:
     """sensor_msgs/PointCloud2 of points (N, 3), metres, or (N, 4) with their height."""
     kind = POINT_TYPE if points.shape[1] == 3 else _HEIGHT_TYPE
     return cloud_message(make, header, unstructured_to_structured(points, kind))

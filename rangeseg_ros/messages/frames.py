@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Singles
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.messages.clouds import points_from_message
@@ -38,7 +39,7 @@ class DepthFrame:
         return str(self.message.header.frame_id)
 
     @property
-    def depth(self) -> NDArray[np.uint16] | NDArray[np.float32]:
+    def depth(self) -> NDArray[np.uint16] | Singles:
         """Depth image (H, W): millimetres with 0 invalid, or metres with NaN or <= 0 invalid."""
         return depth_from_message(self.message, self.camera.shape if self.camera else None)
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from rangeseg_ros.core.arrays import Singles
 from rangeseg_ros.messages.make import IMAGE, Make, MessageError, elements
 
 # REP 118: millimetres as unsigned integers, or metres as floats.
@@ -22,7 +23,7 @@ _HEADER = struct.Struct('<iff')
 
 def depth_from_message(
     message: Any, shape: tuple[int, int] | None = None
-) -> NDArray[np.uint16] | NDArray[np.float32]:
+) -> NDArray[np.uint16] | Singles:
     """Depth image (H, W) of a sensor_msgs/Image, or a CompressedImage of compressedDepth.
 
     uint16 in millimetres or float32 in metres, native byte order; a view of the data where that is
@@ -32,7 +33,7 @@ def depth_from_message(
     return _compressed(message, shape) if hasattr(message, 'format') else _plain(message)
 
 
-def _plain(message: Any) -> NDArray[np.uint16] | NDArray[np.float32]:
+def _plain(message: Any) -> NDArray[np.uint16] | Singles:
     """Image whose rows may be padded, the last one not."""
     height, width, encoding = message.height, message.width, message.encoding
     if encoding not in PIXEL_TYPES:
@@ -45,9 +46,7 @@ def _plain(message: Any) -> NDArray[np.uint16] | NDArray[np.float32]:
     return np.ascontiguousarray(elements(message, kind, message.step, encoding))
 
 
-def _compressed(
-    message: Any, shape: tuple[int, int] | None
-) -> NDArray[np.uint16] | NDArray[np.float32]:
+def _compressed(message: Any, shape: tuple[int, int] | None) -> NDArray[np.uint16] | Singles:
     """Image of compressed_depth_image_transport: a 12-byte header and a 16-bit PNG.
 
     32FC1 is quantised in inverse depth: depth = a / (value - b), 0 invalid, a and b in the header.

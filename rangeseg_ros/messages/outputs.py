@@ -9,8 +9,8 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Singles
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground import points
 from rangeseg_ros.core.ground.cells import GROUND, OBSTACLE
@@ -53,11 +53,11 @@ def _image(encoding: str, pick: Pick) -> Output:
 
 
 def _points(
-    find: Callable[[RangeImage, Terrain], NDArray[np.float32]], most: int = points.MOST_POINTS
+    find: Callable[[RangeImage, Terrain], Singles], most: int = points.MOST_POINTS
 ) -> Output:
     """A topic of points of the terrain, thinned to so many."""
 
-    def pick(image: RangeImage, result: Segmentation) -> NDArray[np.float32]:
+    def pick(image: RangeImage, result: Segmentation) -> Singles:
         if result.ground is None:
             return np.zeros((0, 4), np.float32)
         size = result.survey.config.cloud_resolution if isinstance(result.survey, Survey) else 0.0

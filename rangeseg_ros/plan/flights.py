@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.ground.stairs import Stairs
 from rangeseg_ros.core.mapping.transforms import Transform
 
@@ -21,7 +21,7 @@ class Flight(NamedTuple):
     Metres, from above. `rise` and `run` are those of a tread, `direction` is 'up' or 'down'.
     """
 
-    edges: NDArray[np.float64]
+    edges: Floats
     rise: float
     run: float
     direction: str
@@ -38,7 +38,7 @@ def flights(seen: Sequence[tuple[Stairs, Transform]]) -> list[Flight]:
     Of each, the stairs and the motion that takes the frame of the image to that of the plan.
     Stairs are one flight where their first edges are less than a run apart and face one way.
     """
-    groups: list[list[tuple[Stairs, NDArray[np.float64], NDArray[np.float64]]]] = []
+    groups: list[list[tuple[Stairs, Floats, Floats]]] = []
     for stairs, pose in seen:
         ends = pose.apply(stairs.edge)[:, :2]
         along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])

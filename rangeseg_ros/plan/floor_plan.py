@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.stairs import Stairs
 from rangeseg_ros.core.mapping.adjustment import Solution
@@ -31,7 +32,7 @@ FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 _SAMPLES = 120
 
 
-def points_within(image: RangeImage, sensor: SensorModel, error: float) -> NDArray[np.float64]:
+def points_within(image: RangeImage, sensor: SensorModel, error: float) -> Floats:
     """Some points (N, 3) of an image that err by less than `error` along the ray, metres."""
     step = max(min(image.shape) // _SAMPLES, 1)
     sample = np.s_[::step, ::step]
@@ -43,10 +44,7 @@ def points_within(image: RangeImage, sensor: SensorModel, error: float) -> NDArr
 
 
 def occupancy(
-    points: Iterable[NDArray[np.float64]],
-    ground: float,
-    band: tuple[float, float],
-    resolution: float,
+    points: Iterable[Floats], ground: float, band: tuple[float, float], resolution: float
 ) -> PlaneGrid:
     """Log-odds that something stands in the way in cells of the ground.
 
@@ -73,7 +71,7 @@ class Up(NamedTuple):
     Its standard deviation, radians, is 0 where it was told.
     """
 
-    direction: NDArray[np.float64]
+    direction: Floats
     deviation: float
     source: str
 
@@ -82,14 +80,14 @@ class Wall(NamedTuple):
     """Where a plane of the plan stands upright: ends (N, 2, 2) of its parts, in order along it."""
 
     plane: int
-    segments: NDArray[np.float64]
+    segments: Floats
 
 
 class Opening(NamedTuple):
     """A gap, with its ends (2, 2), in the wall of a plane, through which the ground goes on."""
 
     plane: int
-    ends: NDArray[np.float64]
+    ends: Floats
 
     @property
     def width(self) -> float:
@@ -125,7 +123,7 @@ def deviation_of(plane: MapPlane) -> float:
     return float(np.sqrt(max(lever @ plane.covariance @ lever, 0)))
 
 
-def estimate_up(planes: Sequence[MapPlane], looked: NDArray[np.float64], tolerance: float) -> Up:
+def estimate_up(planes: Sequence[MapPlane], looked: Floats, tolerance: float) -> Up:
     """Which way is up by what is level and what is upright.
 
     Of the directions of planes near to what was up in the images, that with the largest area of
@@ -165,9 +163,9 @@ def make_plan(
     solution: Solution,
     frame: str,
     up: Up,
-    points: Iterable[NDArray[np.float64]],
+    points: Iterable[Floats],
     stairs: Sequence[tuple[Stairs, Transform]],
-    stood: NDArray[np.float64],
+    stood: Floats,
     config: Config,
     headroom: float,
     resolution: float,
@@ -217,9 +215,7 @@ def _upright(up: Up) -> Transform:
     return Transform(turn, np.zeros(3))
 
 
-def _roles(
-    planes: Sequence[MapPlane], told: NDArray[np.float64], config: Config
-) -> tuple[list[str], float]:
+def _roles(planes: Sequence[MapPlane], told: Floats, config: Config) -> tuple[list[str], float]:
     """Roles of planes in a frame whose z is up, and the height of the ground.
 
     The ground is the large plane that faces up and is nearest to its heights as told (F,), or else

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.mapping.map_planes import MapPlane, moved_onto
 from rangeseg_ros.core.significance import chi2_quantile
 
@@ -30,9 +30,7 @@ class Squared(MapPlane):
     turned: float
 
 
-def square_up(
-    planes: Sequence[MapPlane], covariance: NDArray[np.float64], tolerance: float
-) -> list[Squared]:
+def square_up(planes: Sequence[MapPlane], covariance: Floats, tolerance: float) -> list[Squared]:
     """Make planes level or plumb, and walls parallel or at right angles to each other.
 
     The P planes are in a frame whose z is up, with the covariance (4 P, 4 P) of the normals and
@@ -75,11 +73,11 @@ def square_up(
 class _Conditions:
     """Planes under the conditions that were imposed on them: `values` (4 P,), `covariance`."""
 
-    def __init__(self, planes: Sequence[MapPlane], covariance: NDArray[np.float64]) -> None:
+    def __init__(self, planes: Sequence[MapPlane], covariance: Floats) -> None:
         self.values = np.array([[*plane.normal, plane.distance] for plane in planes]).ravel()
         self.covariance = covariance
 
-    def impose(self, rows: NDArray[np.float64], gap: NDArray[np.float64]) -> bool:
+    def impose(self, rows: Floats, gap: Floats) -> bool:
         """Have `rows` of the values change by `gap`, unless that is too far."""
         spread = rows @ self.covariance @ rows.T
         inverse = np.linalg.pinv(spread)
@@ -90,7 +88,7 @@ class _Conditions:
         self.covariance = self.covariance - gain @ rows @ self.covariance
         return True
 
-    def out_of_square(self, k: int, m: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def out_of_square(self, k: int, m: int) -> tuple[Floats, Floats]:
         """Derivative (1, 4 P) of the difference of two azimuths, and what it lacks (1,)."""
         row, azimuth = np.zeros((1, len(self.values))), []
         for sign, plane in ((1, k), (-1, m)):
@@ -105,7 +103,7 @@ def _modulo(angle: float) -> float:
     return float(angle - np.pi / 2 * np.round(angle / (np.pi / 2)))
 
 
-def _exact(kind: str, own: NDArray[np.float64], seed: NDArray[np.float64]) -> NDArray[np.float64]:
+def _exact(kind: str, own: Floats, seed: Floats) -> Floats:
     """A normal that is level, plumb, or square to that of the seed."""
     if kind == 'level':
         return np.array([0.0, 0.0, np.sign(own[2])])

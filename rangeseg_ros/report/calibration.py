@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Singles
 from rangeseg_ros.core.calibration.calibrate import Calibration
 from rangeseg_ros.report.charts import svg
 from rangeseg_ros.report.page import write_page
@@ -22,7 +22,7 @@ class Shown(NamedTuple):
     """
 
     frame: int
-    residuals: NDArray[np.float32]
+    residuals: Singles
     planes: tuple[int, int]
 
 
@@ -70,16 +70,16 @@ def write_calibration(
     )
 
 
-def _extent(field: NDArray[np.float32]) -> float:
+def _extent(field: Singles) -> float:
     """Where the colours of a field end."""
     return float(np.quantile(np.abs(field), 0.99)) or 1e-6
 
 
-def _rms(field: NDArray[np.float32]) -> float:
+def _rms(field: Singles) -> float:
     return float(np.sqrt(np.nanmean(field**2)))
 
 
-def _images(images: Sequence[tuple[str, NDArray[np.float32], float, float, str]]) -> str:
+def _images(images: Sequence[tuple[str, Singles, float, float, str]]) -> str:
     """Pictures with a title, a range and a colour map each, two in a row."""
     rows = -(-len(images) // 2)
     figure = Figure(figsize=(10, 3.6 * rows), layout='constrained')
@@ -94,7 +94,7 @@ def _images(images: Sequence[tuple[str, NDArray[np.float32], float, float, str]]
     return svg(figure)
 
 
-def _profiles(offset: NDArray[np.float32]) -> str:
+def _profiles(offset: Singles) -> str:
     """Mean of the field over rows and over columns."""
     figure = Figure(figsize=(10, 3.2), layout='constrained')
     both = figure.subplots(1, 2, sharey=True)

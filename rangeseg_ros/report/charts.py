@@ -10,6 +10,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.drawing import colours
 
 MAX_BARS, MAX_LINES = 40, 8
@@ -35,7 +36,7 @@ def runs(frames: NDArray[np.integer]) -> list[tuple[int, int]]:
     return [(int(part[0]), int(part[-1])) for part in parts]
 
 
-def id_bars(sightings: NDArray[np.void], times: NDArray[np.float64]) -> str:
+def id_bars(sightings: NDArray[np.void], times: Floats) -> str:
     """When each plane was in sight: a row for each id, `times` (N,) in seconds of the frames."""
     ids = np.sort(longest_seen(sightings, MAX_BARS))
     figure = Figure(figsize=(10, 1.2 + 0.2 * len(ids)), layout='constrained')
@@ -52,7 +53,7 @@ def id_bars(sightings: NDArray[np.void], times: NDArray[np.float64]) -> str:
     return svg(figure)
 
 
-def drifts(sightings: NDArray[np.void], times: NDArray[np.float64]) -> str:
+def drifts(sightings: NDArray[np.void], times: Floats) -> str:
     """How distance and normal of the largest planes change, relative to their medians."""
     figure = Figure(figsize=(10, 5.5), layout='constrained')
     upper, lower = figure.subplots(2, 1, sharex=True)

@@ -9,11 +9,11 @@ from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Imu
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.placement import AT_REST, Placement, find_placement
 from rangeseg_ros.core.mapping.transforms import Transform, TransformBuffer, TransformError
@@ -41,7 +41,7 @@ class Reading(NamedTuple):
 
     frame: str
     stamp: int
-    acceleration: NDArray[np.float64]
+    acceleration: Floats
 
     def followed_by(self, new: Reading) -> Reading:
         """The new reading smoothed by this one; as it is in another frame or earlier in time."""

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+
+from rangeseg_ros.core.arrays import Floats
 
 
 def smooth_field(
     shape: tuple[int, ...], sigma: tuple[float, float] | None, random: np.random.Generator
-) -> NDArray[np.float64]:
+) -> Floats:
     """Gaussian random field (H, W) of unit variance: white noise, smoothed unless `sigma` is None.
 
     `sigma` are the standard deviations of the Gaussian kernel along a row and a column, pixels.
@@ -23,5 +24,5 @@ def smooth_field(
     )
     gain = np.linalg.norm(kernel_x) * np.linalg.norm(kernel_y)
     field = cv2.sepFilter2D(white, cv2.CV_64F, kernel_x, kernel_y) / gain
-    inside: NDArray[np.float64] = field[pad_y : pad_y + shape[0], pad_x : pad_x + shape[1]]
+    inside: Floats = field[pad_y : pad_y + shape[0], pad_x : pad_x + shape[1]]
     return inside

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Singles
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.simulation.fields import smooth_field
 from rangeseg_ros.simulation.scenes import Scene
@@ -29,7 +30,7 @@ class TruePlane:
 
     label: int
     face: int
-    normal: NDArray[np.float64]
+    normal: Floats
     distance: float
     count: int
 
@@ -43,7 +44,7 @@ class Frame:
     measurement, `NOT_PLANAR` on curved ones.
     """
 
-    depth: NDArray[np.uint16] | NDArray[np.float32]
+    depth: NDArray[np.uint16] | Singles
     labels: NDArray[np.uint16]
     planes: list[TruePlane]
     camera: Camera
@@ -74,7 +75,7 @@ def simulate(
 
 
 def visible_regions(
-    face: NDArray[np.int32], planes: NDArray[np.float64]
+    face: NDArray[np.int32], planes: Floats
 ) -> tuple[NDArray[np.uint16], list[TruePlane]]:
     """4-connected regions of the planar faces seen in an image.
 

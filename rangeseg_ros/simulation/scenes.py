@@ -9,9 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.simulation.solids import Solid, about_z, box, cast, cylinder, half_space, sphere
 
 OPTICAL_IN_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -22,8 +23,8 @@ OPTICAL_IN_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
 class Pose:
     """Where a sensor stands: world-from-sensor rotation (3, 3), and its origin (3,), metres."""
 
-    rotation: NDArray[np.float64]
-    position: NDArray[np.float64]
+    rotation: Floats
+    position: Floats
 
     @classmethod
     def looking(cls, position: ArrayLike, yaw: float, pitch: float, roll: float) -> Pose:
@@ -45,9 +46,9 @@ class Scene:
 
     solids: tuple[Solid, ...]
     poses: tuple[Pose, ...]
-    dark: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4)))
+    dark: Floats = field(default_factory=lambda: np.zeros((0, 4)))
 
-    def planes(self, pose: Pose) -> NDArray[np.float64]:
+    def planes(self, pose: Pose) -> Floats:
         """(F, 4) equations (normal, distance) of all faces in the frame of a sensor at `pose`.
 
         Normals point out of the solids, so towards the sensor on every visible face; NaN for
@@ -149,8 +150,8 @@ class _Room:
             half_space(beside, -random.uniform(0.9, 1.6) * beside),
         ]
         self.solids = [half_space((0, 0, 1), (0, 0, 0)), *self.walls]
-        self.occupied: list[tuple[NDArray[np.float64], float]] = []
-        self.tops: list[tuple[NDArray[np.float64], float, float, float]] = []
+        self.occupied: list[tuple[Floats, float]] = []
+        self.tops: list[tuple[Floats, float, float, float]] = []
 
     def add_box(self) -> None:
         """Add a box: resting on the floor, stacked, or tilted and perhaps floating."""
@@ -196,7 +197,7 @@ class _Room:
         radii = distance * np.radians(self.random.uniform(3, 6, len(rays)))
         return Scene(tuple(self.solids), poses, np.column_stack([centres, radii]))
 
-    def _free_place(self, radius: float, near: float, far: float) -> NDArray[np.float64]:
+    def _free_place(self, radius: float, near: float, far: float) -> Floats:
         """(x, y) of an upright cylinder of that radius that is in view and touches nothing.
 
         After many failures the objects may overlap; they are then cast as one body.

@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.runtime.threads import map_halves
 
 
@@ -24,23 +25,23 @@ class Solid:
         the offset d (metres), and of convex quadrics.
     """
 
-    faces: NDArray[np.float64]
+    faces: Floats
 
     @property
-    def planes(self) -> NDArray[np.float64]:
+    def planes(self) -> Floats:
         """(F, 4) plane equations (normal, offset) of the faces; NaN for curved ones."""
         planes = np.column_stack([2 * self.faces[:, 3, :3], self.faces[:, 3, 3]])
         planes[self.faces[:, :3, :3].any(axis=(1, 2))] = np.nan
         return planes
 
-    def transformed(self, back: NDArray[np.float64]) -> Solid:
+    def transformed(self, back: Floats) -> Solid:
         """The solid whose points the matrix `back` (4, 4) takes to points of this one."""
         return Solid(back.T @ self.faces @ back)
 
 
 def cast(
     solids: Sequence[Solid], origins: ArrayLike, directions: ArrayLike
-) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+) -> tuple[Floats, NDArray[np.int32]]:
     """First hit of every ray, of one origin (3,) or one for each (..., 3).
 
     Returns its distance (...) in lengths of the direction (..., 3), inf where nothing is hit, and
@@ -64,11 +65,11 @@ def cast(
 def _enter(
     start: int,
     after: int,
-    origins: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    faces: NDArray[np.float64],
+    origins: Floats,
+    directions: Floats,
+    faces: Floats,
     first: int,
-    distance: NDArray[np.float64],
+    distance: Floats,
     face: NDArray[np.int32],
 ) -> None:
     """Where rays start...after enter a solid, if that is nearer than `distance`, which is set.
@@ -93,7 +94,7 @@ def _enter(
 
 @njit(cache=True)
 def _interval(
-    q: NDArray[np.float64], k: int, x: float, y: float, z: float, u: float, v: float, w: float
+    q: Floats, k: int, x: float, y: float, z: float, u: float, v: float, w: float
 ) -> tuple[float, float]:
     """Between which t on a ray p'Qp = a t^2 + 2 b t + c <= 0, Q = q[k]; (inf, -inf) for none."""
     a, b = 0.0, q[k, 3, 0] * u + q[k, 3, 1] * v + q[k, 3, 2] * w
@@ -153,18 +154,18 @@ def cylinder(radius: float, height: float, rotation: ArrayLike, centre: ArrayLik
     return _placed(Solid(faces), rotation, centre)
 
 
-def about_z(degrees: float) -> NDArray[np.float64]:
+def about_z(degrees: float) -> Floats:
     """Rotation about the vertical."""
-    rotation: NDArray[np.float64] = Rotation.from_euler('z', degrees, degrees=True).as_matrix()
+    rotation: Floats = Rotation.from_euler('z', degrees, degrees=True).as_matrix()
     return rotation
 
 
-def _ends(height: float) -> NDArray[np.float64]:
+def _ends(height: float) -> Floats:
     """Top and bottom, (2, 4), of a solid of that height about its origin."""
     return np.array([[0, 0, 1, -height / 2], [0, 0, -1, -height / 2]])
 
 
-def _flat(planes: NDArray[np.float64]) -> Solid:
+def _flat(planes: Floats) -> Solid:
     """The solid of planar faces: plane equations (F, 4)."""
     faces = np.zeros((len(planes), 4, 4))
     faces[:, 3] = faces[:, :, 3] = planes * (0.5, 0.5, 0.5, 1)

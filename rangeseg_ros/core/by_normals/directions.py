@@ -12,13 +12,14 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.config import DIRECTION_COUNTS
 
 _EQUATOR = 1e-9  # rounding
 
 
 @lru_cache(maxsize=8)
-def directions(count: int) -> NDArray[np.float64]:
+def directions(count: int) -> Floats:
     """Unit vectors (count, 3) over the hemisphere, not to be written to.
 
     Vertices of an icosahedron after Loop subdivision (thesis 5.2.2, appendix A.2), those strictly
@@ -39,9 +40,7 @@ def directions(count: int) -> NDArray[np.float64]:
     return found
 
 
-def _subdivide(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _subdivide(vertices: Floats, faces: NDArray[np.int64]) -> tuple[Floats, NDArray[np.int64]]:
     """Split every triangle in four by new vertices at the middles of its edges."""
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2)
     unique, inverse = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)

@@ -19,6 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Mask, Singles
 from rangeseg_ros.core.graphcut import expansion
 from rangeseg_ros.core.graphcut.expansion import (
     ROUNDING,
@@ -38,7 +39,7 @@ _SIZE = 8
 
 
 def minimise(
-    normals: NDArray[np.float32], directions: NDArray[np.float32], grid: Grid, smoothness: float
+    normals: Singles, directions: Singles, grid: Grid, smoothness: float
 ) -> NDArray[np.int32]:
     """Labelling (H, W) of low energy (eq. 5.3 and 5.5, lambda = `smoothness`).
 
@@ -56,14 +57,14 @@ def minimise(
 
 
 def minimise_exactly(
-    normals: NDArray[np.float32], directions: NDArray[np.float32], grid: Grid, smoothness: float
+    normals: Singles, directions: Singles, grid: Grid, smoothness: float
 ) -> NDArray[np.int32]:
     """What `minimise` finds, from the nearest direction at every pixel on.
 
     No expansion of a label over the image improves it (thesis 4.8).
     """
 
-    def cost(label: int, pixels: NDArray[np.int32]) -> NDArray[np.float32]:
+    def cost(label: int, pixels: NDArray[np.int32]) -> Singles:
         return label_costs(label, pixels, 1, normals, directions)
 
     labels = _nearest(normals, directions, 1)
@@ -75,9 +76,7 @@ def minimise_exactly(
 
 
 @njit(cache=True, nogil=True)
-def _nearest_directions(
-    normals: NDArray[np.float32], directions: NDArray[np.float32]
-) -> NDArray[np.int32]:
+def _nearest_directions(normals: Singles, directions: Singles) -> NDArray[np.int32]:
     """Direction (K, 3) nearest to each normal (h, w, 3), of any length: (h, w) index, else 0."""
     labels = np.zeros(normals.shape[:2], np.int32)
     for i in range(len(labels)):
@@ -91,14 +90,12 @@ def _nearest_directions(
     return labels
 
 
-def _nearest(
-    normals: NDArray[np.float32], directions: NDArray[np.float32], size: int
-) -> NDArray[np.int32]:
+def _nearest(normals: Singles, directions: Singles, size: int) -> NDArray[np.int32]:
     """Direction nearest to the mean of each square's normals."""
     return _nearest_directions(_per_square(np.add, np.nan_to_num(normals), size), directions)
 
 
-def _largest_parts(grid: Grid) -> NDArray[np.bool_]:
+def _largest_parts(grid: Grid) -> Mask:
     """Pixels (H, W) in the largest connected part of their square."""
     shape = len(grid.right), grid.below.shape[1]
     rows, columns = (-(-length // _SIZE) for length in shape)
@@ -106,11 +103,11 @@ def _largest_parts(grid: Grid) -> NDArray[np.bool_]:
     parts = connected_components(squares, grid, np.ones(shape, np.bool_))
     area = np.bincount(parts.ravel())[parts]
     largest = _enlarged(_per_square(np.maximum, area, _SIZE), _SIZE, shape)
-    inside: NDArray[np.bool_] = area == largest
+    inside: Mask = area == largest
     return inside
 
 
-def _between_squares(links: NDArray[np.float32], inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _between_squares(links: Singles, inside: Mask) -> Singles:
     """Links (2, h, w) of the squares, sums of those (2, H, W) between pixels `inside` (H, W)."""
     right, below = np.zeros_like(links)
     last, next_ = slice(_SIZE - 1, -1, _SIZE), slice(_SIZE, None, _SIZE)
@@ -132,11 +129,7 @@ def _enlarged(squares: NDArray[Any], size: int, shape: tuple[int, ...]) -> NDArr
 
 
 def _expand(
-    labels: NDArray[np.int32],
-    size: int,
-    links: NDArray[np.float32],
-    normals: NDArray[np.float32],
-    directions: NDArray[np.float32],
+    labels: NDArray[np.int32], size: int, links: Singles, normals: Singles, directions: Singles
 ) -> None:
     """Expand the labels (h, w) of sites of `size` x `size` pixels; in place."""
     height, width = labels.shape
@@ -150,8 +143,8 @@ def _expand_rows(
     rows: tuple[int, int],
     labelling: GridLabelling,
     size: int,
-    normals: NDArray[np.float32],
-    directions: NDArray[np.float32],
+    normals: Singles,
+    directions: Singles,
 ) -> None:
     """Expand every label in some rows from its borders, as far as it gains; in place."""
     start, sites = fronts(labelling, len(directions), rows)
@@ -167,11 +160,8 @@ def _expand_rows(
 
 @njit(cache=True, nogil=True)
 def data_costs(
-    labels: NDArray[np.int32],
-    size: int,
-    normals: NDArray[np.float32],
-    directions: NDArray[np.float32],
-) -> NDArray[np.float32]:
+    labels: NDArray[np.int32], size: int, normals: Singles, directions: Singles
+) -> Singles:
     """Cost (h, w) of every site's own label, of normals (H, W, 3) and directions (K, 3)."""
     costs = np.empty(labels.shape, np.float32)
     for i in range(labels.shape[0]):
@@ -182,12 +172,8 @@ def data_costs(
 
 @njit(cache=True, nogil=True)
 def label_costs(
-    label: int,
-    sites: NDArray[np.integer],
-    size: int,
-    normals: NDArray[np.float32],
-    directions: NDArray[np.float32],
-) -> NDArray[np.float32]:
+    label: int, sites: NDArray[np.integer], size: int, normals: Singles, directions: Singles
+) -> Singles:
     """Cost (s,) of one label at sites (s,); the rest as of `data_costs`."""
     width = -(-normals.shape[1] // size)
     costs = np.empty(len(sites), np.float32)
@@ -198,9 +184,7 @@ def label_costs(
 
 
 @njit(cache=True, inline='always')
-def _cost(
-    direction: NDArray[np.float32], row: int, column: int, size: int, normals: NDArray[np.float32]
-) -> np.float32:
+def _cost(direction: Singles, row: int, column: int, size: int, normals: Singles) -> np.float32:
     height, width = normals.shape[:2]
     a, b, c = direction
     total = np.float32(0)

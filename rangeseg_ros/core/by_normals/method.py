@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Singles
 from rangeseg_ros.core.by_normals.directions import directions
 from rangeseg_ros.core.by_normals.labelling import data_costs, minimise, minimise_exactly
 from rangeseg_ros.core.by_normals.normals import observed_normals
@@ -22,12 +23,12 @@ class Labelling:
     """Discretised normals as labels of the pixels of an image."""
 
     labels: NDArray[np.int32]  # (H, W), indices of directions
-    directions: NDArray[np.float32]  # (K, 3), unit vectors towards the sensor
-    observed: NDArray[np.float32]  # (H, W, 3), NaN where undefined
+    directions: Singles  # (K, 3), unit vectors towards the sensor
+    observed: Singles  # (H, W, 3), NaN where undefined
     grid: Grid
     smoothness: float  # lambda
 
-    def normals(self) -> NDArray[np.float32]:
+    def normals(self) -> Singles:
         """The reconstructed normals (H, W, 3)."""
         return self.directions[self.labels]
 

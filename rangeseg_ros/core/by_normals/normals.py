@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Mask, Singles
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import cofactors
@@ -16,7 +16,7 @@ _ROWS, _COLUMNS = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
 _SYMMETRIC = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
 
 
-def observed_normals(image: RangeImage, grid: Grid, config: Config) -> NDArray[np.float32]:
+def observed_normals(image: RangeImage, grid: Grid, config: Config) -> Singles:
     """Normals by the method that `config` names.
 
     With jump edges by plane deviation, which lie between pixels, there are none where a tangent
@@ -32,7 +32,7 @@ def observed_normals(image: RangeImage, grid: Grid, config: Config) -> NDArray[n
     return normals
 
 
-def cross_product(image: RangeImage, baseline: int = 1) -> NDArray[np.float32]:
+def cross_product(image: RangeImage, baseline: int = 1) -> Singles:
     """Cross product of the tangents between the neighbours of a pixel (thesis 5.7.1).
 
     Between those so many pixels to the left and right, above and below, which must be measured; 1
@@ -50,7 +50,7 @@ def cross_product(image: RangeImage, baseline: int = 1) -> NDArray[np.float32]:
     return _towards_sensor(np.stack([x, y, z], axis=-1), image)
 
 
-def plane_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
+def plane_fit(image: RangeImage, radius: int = 2) -> Singles:
     """Plane of least squares in inverse range through 2 radius + 1 rows and columns (5.7.2).
 
     That is where the noise of structured light and stereo is constant. The plane n . p + d = 0 is
@@ -65,16 +65,14 @@ def plane_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
     return _towards_sensor((inverse @ right[..., None])[..., 0], image, radius)
 
 
-def _means(values: NDArray[np.float64], radius: int) -> NDArray[np.float64]:
+def _means(values: Floats, radius: int) -> Floats:
     """Means (H, W, n) over windows, as if 0 outside the image."""
     size = 2 * radius + 1, 2 * radius + 1
     means = cv2.boxFilter(values, -1, size, borderType=cv2.BORDER_CONSTANT)
     return np.asarray(means, np.float64)
 
 
-def _towards_sensor(
-    normals: NDArray[np.float64], image: RangeImage, radius: int = 0
-) -> NDArray[np.float32]:
+def _towards_sensor(normals: Floats, image: RangeImage, radius: int = 0) -> Singles:
     """Unit vectors against the rays; NaN for vectors without a direction and for windows that
     reach out of the image or hold a pixel that was not measured."""
     kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
@@ -87,7 +85,7 @@ def _towards_sensor(
     return (normals * scale[..., None]).astype(np.float32)
 
 
-def _within(edges: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+def _within(edges: Mask, reach: int) -> Mask:
     """Pixels (H, W) with an edge of (H, W-1) among the `reach` to their left or right."""
     framed = np.pad(edges, ((0, 0), (reach, reach)))
     kernel = np.ones((1, 2 * reach), np.uint8)

@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Labels, Singles
 from rangeseg_ros.core.by_planes.plane_energy import CAP, NO_PLANE, Models
 from rangeseg_ros.core.by_planes.shifts import shift_at
 from rangeseg_ros.core.sensing.blocks import NODE
@@ -22,14 +23,14 @@ _LABELS = 4
 
 
 def with_sharp_borders(
-    regions: NDArray[np.uint16],
+    regions: Labels,
     surfaces: NDArray[np.int32],
     models: Models,
     image: RangeImage,
     side: int,
     sensor: SensorModel,
     prior: float,
-) -> NDArray[np.uint16]:
+) -> Labels:
     """Labels (H, W) of the pixels of an image of errors `sensor`; 0 where nothing was measured.
 
     Given are the regions (h, w) of bins, which have `side` pixels along their side, and the labels
@@ -44,16 +45,16 @@ def with_sharp_borders(
 
 @njit(cache=True, nogil=True)
 def _settle(
-    regions: NDArray[np.uint16],
+    regions: Labels,
     surfaces: NDArray[np.int32],
     models: Models,
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
+    inverse: Singles,
+    rays: Singles,
     pinhole: bool,
     sensor: SensorModel,
     prior: float,
     side: int,
-    labels: NDArray[np.uint16],
+    labels: Labels,
 ) -> None:
     """Give pixels of bins beside others the label of the lowest cost, in place."""
     (rows, columns), (height, width) = regions.shape, labels.shape

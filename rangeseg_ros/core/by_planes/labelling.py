@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Singles
 from rangeseg_ros.core.by_planes.plane_energy import (
     LEAST_GAIN,
     NO_PLANE,
@@ -28,8 +29,8 @@ _DOMAIN = 4
 def refine(
     problem: Problem,
     surfaces: NDArray[np.int32],
-    blocks: NDArray[np.float64],
-    moments: NDArray[np.float64],
+    blocks: Floats,
+    moments: Floats,
     sensor: SensorModel,
 ) -> tuple[NDArray[np.int32], Models]:
     """Label the pixels (n,) with the planes of the surfaces (rows, columns) of blocks, or 0.
@@ -58,7 +59,7 @@ def _label_blocks(
     after: int,
     surfaces: NDArray[np.int32],
     labels: NDArray[np.int32],
-    data: NDArray[np.float32],
+    data: Singles,
     problem: Problem,
     models: Models,
 ) -> None:

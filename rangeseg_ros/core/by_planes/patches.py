@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices, Mask
 from rangeseg_ros.core.by_planes.region_graph import find_roots, renumbered, singles
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import NODE, Blocks
@@ -50,10 +51,10 @@ class Nodes(NamedTuple):
     (rows - 1, columns) tell whether a block touches its right, its lower neighbour.
     """
 
-    moments: NDArray[np.float64]
-    residual: NDArray[np.float64]
-    right: NDArray[np.bool_]
-    below: NDArray[np.bool_]
+    moments: Floats
+    residual: Floats
+    right: Mask
+    below: Mask
 
     @classmethod
     def of(cls, view: View) -> Nodes:
@@ -72,11 +73,11 @@ def _weigh(
     first: int,
     after: int,
     blocks: Blocks,
-    valid: NDArray[np.bool_],
+    valid: Mask,
     grid: Grid,
     sensor: SensorModel,
-    right: NDArray[np.bool_],
-    below: NDArray[np.bool_],
+    right: Mask,
+    below: Mask,
 ) -> None:
     """Weigh moments and residuals of rows first...after of blocks, in place; tell which touch.
 
@@ -110,9 +111,7 @@ def _weigh(
             blocks.residual[bi, bj] *= weight
 
 
-def find_patches(
-    nodes: Nodes, sensor: SensorModel
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+def find_patches(nodes: Nodes, sensor: SensorModel) -> tuple[NDArray[np.int32], Floats]:
     """Connected blocks on one plane, over which the distortion is nearly constant.
 
     The patch (rows, columns) of each block, 0 for none, otherwise 1...P, and moments (P + 1, 13).
@@ -130,7 +129,7 @@ def find_patches(
 @njit(cache=True, nogil=True)
 def _patches(
     first: int, after: int, nodes: Nodes, largest: float, agreement: float
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+) -> tuple[NDArray[np.int32], Floats]:
     """Patches of at most `largest` pixels in some rows of blocks, 1...P, and their moments.
 
     `agreement`: by how much the noise of neighbours exceeds white noise, see `SensorModel`.
@@ -160,11 +159,7 @@ def _patches(
 
 @njit(cache=True)
 def _chains(
-    number: NDArray[np.uint32],
-    smooth: NDArray[np.bool_],
-    right: NDArray[np.bool_],
-    below: NDArray[np.bool_],
-    count: int,
+    number: NDArray[np.uint32], smooth: Mask, right: Mask, below: Mask, count: int
 ) -> tuple[NDArray[np.uint32], ...]:
     """Half-edges between `count` parts, whose `number` blocks have, where smooth blocks touch.
 
@@ -192,7 +187,7 @@ def _chains(
 
 
 @njit(cache=True, error_model='numpy')
-def _misfit(extra: float, moments: NDArray[np.float64], k: int, m: int, agreement: float) -> float:
+def _misfit(extra: float, moments: Floats, k: int, m: int, agreement: float) -> float:
     """Extra chi-squared of one plane for two of the parts (N, 13), in what it may be at most."""
     first, second = moments[k, COUNT], moments[m, COUNT]
     pixels = first + second
@@ -202,13 +197,8 @@ def _misfit(extra: float, moments: NDArray[np.float64], k: int, m: int, agreemen
 
 @njit(cache=True)
 def _quads(
-    moments: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    smooth: NDArray[np.bool_],
-    right: NDArray[np.bool_],
-    below: NDArray[np.bool_],
-    largest: float,
-) -> NDArray[np.intp]:
+    moments: Floats, residual: Floats, smooth: Mask, right: Mask, below: Mask, largest: float
+) -> Indices:
     """Merge every 2 x 2 blocks that clearly lie on one plane, and 2 x 2 of these; in place.
 
     Most blocks do; merging these at once saves the queue of `_grow` most of its work. Returns
@@ -250,8 +240,8 @@ def _quads(
 
 @njit(cache=True, error_model='numpy')
 def _grow(
-    moments: NDArray[np.float64],
-    residual: NDArray[np.float64],
+    moments: Floats,
+    residual: Floats,
     chains: tuple[NDArray[np.uint32], ...],
     largest: float,
     agreement: float,

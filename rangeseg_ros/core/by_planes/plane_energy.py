@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Singles
 from rangeseg_ros.core.by_planes.shifts import Shifts, shift_at
 from rangeseg_ros.core.graphcut.expansion import link_costs
 from rangeseg_ros.core.runtime.threads import map_halves
@@ -32,11 +33,11 @@ class Problem(NamedTuple):
     `pinhole`: whether rays of a column differ in y alone, and those of a row not in y.
     """
 
-    inverse: NDArray[np.float32]  # (n,)
-    rays: NDArray[np.float32]  # (n, 3)
+    inverse: Singles  # (n,)
+    rays: Singles  # (n, 3)
     pinhole: bool
-    weight: NDArray[np.float32]  # (n,), 1 / random variance, 0 where nothing was measured
-    links: NDArray[np.float32]  # (2, n), see `link_costs`
+    weight: Singles  # (n,), 1 / random variance, 0 where nothing was measured
+    links: Singles  # (2, n), see `link_costs`
     width: int  # columns of the image
 
     @classmethod
@@ -54,7 +55,7 @@ class Problem(NamedTuple):
 
 # Divides by zero where numpy does, and without branches, so that many pixels are taken at a time.
 @njit(cache=True, nogil=True, error_model='numpy')
-def _weights(inverse: NDArray[np.float32], sensor: SensorModel) -> NDArray[np.float32]:
+def _weights(inverse: Singles, sensor: SensorModel) -> Singles:
     """1 / random variance of inverse ranges (n,); 0 where nothing was measured."""
     weight = np.empty(len(inverse), np.float32)
     for p in range(len(inverse)):
@@ -70,12 +71,12 @@ class Models(NamedTuple):
     squared residual in random variances costs. `shifts`: how much nearer they look at each block.
     """
 
-    theta: NDArray[np.float64]
-    half_precision: NDArray[np.float64]
+    theta: Floats
+    half_precision: Floats
     shifts: Shifts
 
     @classmethod
-    def of(cls, moments: NDArray[np.float64], smooth: float) -> Models:
+    def of(cls, moments: Floats, smooth: float) -> Models:
         """Planes of moment vectors (K + 1, 13), as yet without shifts.
 
         Regions of `smooth` pixels meet half the variance of the distortion.
@@ -109,7 +110,7 @@ def data_cost(label: int, p: int, problem: Problem, models: Models) -> float:
 
 
 @njit(cache=True)
-def costs(labels: NDArray[np.int32], problem: Problem, models: Models) -> NDArray[np.float32]:
+def costs(labels: NDArray[np.int32], problem: Problem, models: Models) -> Singles:
     """What each pixel's label costs it, (n,); 0 where nothing was measured."""
     cost = np.zeros(len(labels), np.float32)
     for p in range(len(labels)):
@@ -120,7 +121,7 @@ def costs(labels: NDArray[np.int32], problem: Problem, models: Models) -> NDArra
 
 def region_moments(
     labels: NDArray[np.integer], count: int, image: RangeImage, sensor: SensorModel
-) -> NDArray[np.float64]:
+) -> Floats:
     """Moments (count, 13) of the pixels of each of `count` labels (H, W); zeros for label 0."""
     given = labels, count, image.inverse, image.rays, sensor
     upper, lower = map_halves(_sum_moments, len(labels), *given)
@@ -133,10 +134,10 @@ def _sum_moments(
     after: int,
     labels: NDArray[np.integer],
     count: int,
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
+    inverse: Singles,
+    rays: Singles,
     sensor: SensorModel,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Those of rows first...after of pixels."""
     total = np.zeros((count, SIZE))
     for i in range(first, after):

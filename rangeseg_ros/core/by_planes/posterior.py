@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices, Labels
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.region_sums import (
     INVERSE,
@@ -40,10 +40,8 @@ PLANE_BEND = 0.0023
 _PLANE, _CURVED = (PLANE_BEND, 0.5), (0.02, 0.9)
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
 
-Floats = NDArray[np.float64]
 
-
-def plane_probabilities(fits: Fits, pairs: NDArray[np.uint16], prior: float) -> Floats:
+def plane_probabilities(fits: Fits, pairs: Labels, prior: float) -> Floats:
     """Posterior probability (M + 1,) of each region to be a plane and no curved surface.
 
     `pairs` (E, 2) of regions touch. They may be parts of one surface, as facets of a cylinder are,
@@ -62,7 +60,7 @@ def plane_probabilities(fits: Fits, pairs: NDArray[np.uint16], prior: float) -> 
 @njit(cache=True, nogil=True)
 def _probabilities(
     sums: RegionSums,
-    pairs: NDArray[np.intp],
+    pairs: Indices,
     total: Floats,
     theta: Floats,
     sensor: SensorModel,
@@ -185,7 +183,7 @@ def _evidence(
 
 
 @njit(cache=True)
-def _terms(cell: Floats, box: NDArray[np.intp]) -> tuple[float, ...]:
+def _terms(cell: Floats, box: Indices) -> tuple[float, ...]:
     """Terms of a quadratic at the mean place of a cell; about 1 within a bounding box."""
     half = max(box[2] - box[0], box[3] - box[1]) / 2
     v = (cell[PLACE] / cell[COUNT] - (box[0] + box[2]) / 2) / half

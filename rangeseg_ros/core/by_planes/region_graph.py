@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices, Mask
 from rangeseg_ros.core.sensing.moments import COUNT, sum_by_label
 
 
@@ -21,14 +22,12 @@ class Contacts(NamedTuple):
     head: NDArray[np.int32]  # (N,), first half-edge of each part, -1 for none
     link: NDArray[np.int32]  # (2E,), the next one of the same part, -1 for none
     target: NDArray[np.int32]  # (2E,), part that a half-edge leads to
-    length: NDArray[np.float64]  # (E,), of the common border, blocks; 0 where parts were joined
+    length: Floats  # (E,), of the common border, blocks; 0 where parts were joined
     place: NDArray[np.int32]  # (N,), room for `absorb`, all -1
 
 
 @njit(cache=True, nogil=True)
-def find_contacts(
-    part: NDArray[np.int32], right: NDArray[np.bool_], below: NDArray[np.bool_], count: int
-) -> Contacts:
+def find_contacts(part: NDArray[np.int32], right: Mask, below: Mask, count: int) -> Contacts:
     """Contacts between parts 1...count - 1 of blocks (rows, columns), 0 for none, see `Nodes`."""
     rows, columns = part.shape
     head = np.full(count, -1, np.int32)
@@ -62,9 +61,7 @@ def find_contacts(
 
 
 @njit(cache=True, nogil=True)
-def absorb(
-    contacts: Contacts, strips: NDArray[np.float64], apart: NDArray[np.float64], a: int, b: int
-) -> None:
+def absorb(contacts: Contacts, strips: Floats, apart: Floats, a: int, b: int) -> None:
     """Let part a take the contacts of part b over, in place; where both touch a third, add up.
 
     Added are the lengths, and the `strips` (2E, N) of the half-edges; of contacts that end `apart`
@@ -102,7 +99,7 @@ def absorb(
 
 
 @njit(cache=True)
-def singles(count: int) -> NDArray[np.intp]:
+def singles(count: int) -> Indices:
     """Parents of nodes that are roots: their own numbers. `np.arange` compiles for a second."""
     parent = np.empty(count, np.intp)
     for a in range(count):
@@ -123,9 +120,7 @@ def find_roots(parent: NDArray[Any]) -> NDArray[Any]:
 
 
 @njit(cache=True, nogil=True)
-def renumbered(
-    root: NDArray[np.intp], moments: NDArray[np.float64], least: float
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+def renumbered(root: Indices, moments: Floats, least: float) -> tuple[NDArray[np.int32], Floats]:
     """Number the clusters of at least so many pixels 1...K, the rest 0; their moments."""
     pixels, number, count = np.zeros(len(root)), np.zeros(len(root), np.int32), 0
     for a in range(len(root)):

@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices, Singles
 from rangeseg_ros.core.fitting.region_sums import find_boxes
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import RATIO
@@ -26,9 +27,9 @@ class Shifts(NamedTuple):
     Those of each plane begin in `values` at `start` (K + 1,), row by row.
     """
 
-    box: NDArray[np.intp]
-    start: NDArray[np.intp]
-    values: NDArray[np.float32]
+    box: Indices
+    start: Indices
+    values: Singles
 
     @classmethod
     def none(cls, count: int) -> Shifts:
@@ -39,8 +40,8 @@ class Shifts(NamedTuple):
 
 def shifts(
     surfaces: NDArray[np.int32],
-    blocks: NDArray[np.float64],
-    theta: NDArray[np.float64],
+    blocks: Floats,
+    theta: Floats,
     reach: int,
     around: int,
     agreement: float,
@@ -88,8 +89,8 @@ def _find_shifts(
     after: int,
     local: Shifts,
     inner: NDArray[np.int32],
-    blocks: NDArray[np.float64],
-    theta: NDArray[np.float64],
+    blocks: Floats,
+    theta: Floats,
     around: int,
     agreement: float,
 ) -> None:

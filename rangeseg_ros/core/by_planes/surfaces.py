@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices, Labels, Mask
 from rangeseg_ros.core.by_planes.patches import Nodes
 from rangeseg_ros.core.by_planes.plane_energy import region_moments
 from rangeseg_ros.core.by_planes.posterior import PLANE_BEND
@@ -65,12 +66,8 @@ class Expected(NamedTuple):
 
 
 def join_surfaces(
-    patches: NDArray[np.int32],
-    moments: NDArray[np.float64],
-    nodes: Nodes,
-    view: View,
-    smoothness: float,
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    patches: NDArray[np.int32], moments: Floats, nodes: Nodes, view: View, smoothness: float
+) -> tuple[NDArray[np.int32], Floats]:
     """Group the patches (rows, columns) of blocks, of moments (P + 1, 13), into planar surfaces.
 
     The surface of each block, 0 for none, otherwise 1...K, and moments (K + 1, 13). Those with
@@ -84,9 +81,7 @@ def join_surfaces(
     return surface[patches], moments
 
 
-def unite_regions(
-    regions: NDArray[np.uint16], view: View, smoothness: float
-) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
+def unite_regions(regions: Labels, view: View, smoothness: float) -> tuple[Labels, Labels]:
     """Unite regions (H, W) whose pixels touch, for the reasons for which patches are.
 
     Where holes or jumps leave no blocks beside each other, their pixels may still touch. Also
@@ -103,12 +98,8 @@ def unite_regions(
 
 @njit(cache=True, nogil=True)
 def _agglomerate(
-    labels: NDArray[np.int32],
-    right: NDArray[np.bool_],
-    below: NDArray[np.bool_],
-    moments: NDArray[np.float64],
-    expected: Expected,
-) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+    labels: NDArray[np.int32], right: Mask, below: Mask, moments: Floats, expected: Expected
+) -> tuple[Indices, NDArray[np.int32]]:
     """Merge the parts 1...P of an image of labels, those that are likeliest one surface first.
 
     Returns the root (P + 1,) of each, and the pairs (E, 2) of parts that touch and are not merged.
@@ -156,11 +147,11 @@ def _ends(target: NDArray[np.int32], e: int) -> tuple[int, int]:
 
 @njit(cache=True)
 def _apart(
-    moments: NDArray[np.float64],
-    residual: NDArray[np.float64],
+    moments: Floats,
+    residual: Floats,
     a: int,
     b: int,
-    strips: NDArray[np.float64],
+    strips: Floats,
     h: int,
     length: float,
     expected: Expected,
@@ -187,7 +178,7 @@ def _apart(
 
 @njit(cache=True)
 def _misfit(
-    extra: float, moments: NDArray[np.float64], k: int, m: int, bend: float, expected: Expected
+    extra: float, moments: Floats, k: int, m: int, bend: float, expected: Expected
 ) -> float:
     """What two parts leave of a common plane beyond their own, in what that may be at most."""
     first, second = moments[k, COUNT], moments[m, COUNT]

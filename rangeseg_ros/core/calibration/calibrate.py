@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices, Mask
 from rangeseg_ros.core.calibration.field import residuals, robust_weights, solve
 from rangeseg_ros.core.calibration.sightings import Sightings, cell_grid, cell_size
 from rangeseg_ros.core.sensing.camera import Camera
@@ -55,13 +55,13 @@ class Fold(NamedTuple):
     """
 
     frames: tuple[int, int]
-    field: NDArray[np.float64]
+    field: Floats
     before: float
     after: float
     weight: float
 
 
-_Block = tuple[NDArray[np.bool_], NDArray[np.float64]]
+_Block = tuple[Mask, Floats]
 
 
 class Calibration(NamedTuple):
@@ -73,7 +73,7 @@ class Calibration(NamedTuple):
     """
 
     distortion: DistortionMap
-    views: NDArray[np.intp]
+    views: Indices
     folds: list[Fold]
     before: float
     after: float
@@ -134,7 +134,7 @@ def calibrate(
     return Calibration(distortion, views, folds, float(mean[0]), float(mean[1]))
 
 
-def _views(seen: Sightings, shape: tuple[int, int]) -> NDArray[np.intp]:
+def _views(seen: Sightings, shape: tuple[int, int]) -> Indices:
     """Number of different distances at which each cell was seen."""
     rows, columns = cell_grid(shape)
     level = np.floor(np.log(np.maximum(seen.inverse, 1e-6)) / np.log1p(_VIEW)).astype(np.intp)
@@ -142,7 +142,7 @@ def _views(seen: Sightings, shape: tuple[int, int]) -> NDArray[np.intp]:
     return np.bincount(pairs[0], minlength=rows * columns).reshape(rows, columns)
 
 
-def _check(seen: Sightings, views: NDArray[np.intp]) -> None:
+def _check(seen: Sightings, views: Indices) -> None:
     frames, covered = len(np.unique(seen.frame)), float((views > 0).mean())
     why = ''
     if frames < _FEWEST_FRAMES:
@@ -161,7 +161,7 @@ def _check(seen: Sightings, views: NDArray[np.intp]) -> None:
         raise CalibrationError(f'{why}; {ADVICE}')
 
 
-def _settled_weights(seen: Sightings, grid: tuple[int, int]) -> NDArray[np.float64]:
+def _settled_weights(seen: Sightings, grid: tuple[int, int]) -> Floats:
     """Weights (N,) by what a field leaves whose own weights know of none."""
     weight = robust_weights(seen, 0.0)
     (field,) = solve(seen, np.ones((1, len(weight))), weight, grid, _SMOOTHNESS[1])
@@ -179,7 +179,7 @@ def _blocks(seen: Sightings, grid: tuple[int, int]) -> list[_Block]:
 
 def _folds(
     seen: Sightings,
-    basis: NDArray[np.float64],
+    basis: Floats,
     blocks: Sequence[_Block],
     grid: tuple[int, int],
     smoothness: Sequence[float],
@@ -198,14 +198,12 @@ def _folds(
     return found
 
 
-def _left(folds: Sequence[Fold]) -> NDArray[np.float64]:
+def _left(folds: Sequence[Fold]) -> Floats:
     """Sums of the squares of what the fields leave of the residuals of each block."""
     return np.array([fold.weight * fold.after**2 for fold in folds])
 
 
-def _deviation(
-    fields: Sequence[NDArray[np.float64]], bias: NDArray[np.float64], known: NDArray[np.bool_]
-) -> NDArray[np.float64]:
+def _deviation(fields: Sequence[Floats], bias: Floats, known: Mask) -> Floats:
     """Standard deviation of a field from those without one block each, and from its bias."""
     each = np.stack([without_plane(field, known) for field in fields])
     variance = (len(fields) - 1) * each.var(axis=0) + without_plane(bias, known) ** 2
@@ -215,7 +213,7 @@ def _deviation(
     return np.asarray(np.sqrt(smooth) * known)
 
 
-def without_plane(field: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
+def without_plane(field: Floats, known: Mask) -> Floats:
     """Field (H, W) less its least-squares plane a u + b v + c where it is known; 0 elsewhere."""
     v, u = np.nonzero(known)
     terms = np.stack([u, v, np.ones(len(u))], axis=1)

@@ -25,10 +25,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.calibration.sightings import Sightings
 from rangeseg_ros.core.significance import CAUCHY
 
@@ -40,11 +40,11 @@ _RIDGE = 1e-9
 
 def solve(
     seen: Sightings,
-    basis: NDArray[np.float64],
-    weight: NDArray[np.float64],
+    basis: Floats,
+    weight: Floats,
     grid: tuple[int, int],
     smoothness: Sequence[float],
-) -> NDArray[np.float64]:
+) -> Floats:
     """Coefficients (K, rows * columns) of the field on the grid, 1/m for the basis 1.
 
     `basis` (K, N) are their factors at the N cells that were seen, `weight` (N,); `smoothness`
@@ -63,7 +63,7 @@ def solve(
     )
     own = (weighted @ cells + smoothing + _RIDGE * sparse.eye(count * size)).tocsc()
 
-    def product(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    def product(vector: Floats) -> Floats:
         planes = (inverses @ (coupling.T @ vector).reshape(-1, 3, 1)).ravel()
         return np.asarray(own @ vector - coupling @ planes)
 
@@ -91,7 +91,7 @@ def _roughness(grid: tuple[int, int], place: int) -> sparse.csr_matrix:
     return (rows.T @ rows).tocsr()
 
 
-def robust_weights(seen: Sightings, error: NDArray[np.float64] | float) -> NDArray[np.float64]:
+def robust_weights(seen: Sightings, error: Floats | float) -> Floats:
     """Weights (N,), at most 1, of cells whose inverse depth is wrong by `error` (N,)."""
     residual = residuals(seen, seen.inverse - error)
     size = np.abs(residual)
@@ -99,14 +99,12 @@ def robust_weights(seen: Sightings, error: NDArray[np.float64] | float) -> NDArr
     # A plane that looks better than most is as likely too small to show its errors.
     middle = [max(float(np.median(part)), typical) for part in np.split(size, seen.start[1:-1])]
     spread = 1.4826 * np.array(middle)[seen.plane()]
-    weight: NDArray[np.float64] = (1.4826 * typical / spread) ** 2
+    weight: Floats = (1.4826 * typical / spread) ** 2
     weight /= 1 + (residual / (CAUCHY * spread)) ** 2
     return weight
 
 
-def residuals(
-    seen: Sightings, inverse: NDArray[np.float64], weight: NDArray[np.float64] | None = None
-) -> NDArray[np.float64]:
+def residuals(seen: Sightings, inverse: Floats, weight: Floats | None = None) -> Floats:
     """What least-squares planes leave of inverse depths (N,), 1/m."""
     weight = np.ones(len(inverse)) if weight is None else weight
     rays = seen.rays()
@@ -114,7 +112,7 @@ def residuals(
     return np.asarray(inverse - rays @ (_plane_inverses(seen, weight) @ sums).ravel())
 
 
-def _plane_inverses(seen: Sightings, weight: NDArray[np.float64]) -> NDArray[np.float64]:
+def _plane_inverses(seen: Sightings, weight: Floats) -> Floats:
     """Inverses (P, 3, 3) of the planes' normal matrices."""
     products = weight[:, None, None] * seen.ray[:, :, None] * seen.ray[:, None]
     sums = np.add.reduceat(products, seen.start[:-1]) + _RIDGE * np.eye(3)

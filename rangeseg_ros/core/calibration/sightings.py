@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from rangeseg_ros.core.arrays import Floats, Indices, Labels, Mask
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.significance import SAMPLES
 
@@ -29,14 +30,14 @@ class Sightings(NamedTuple):
     inverse depth 1/z (N,), 1/m, and its mean ray (N, 3), scaled to z = 1.
     """
 
-    frame: NDArray[np.intp]
-    start: NDArray[np.intp]
-    cell: NDArray[np.intp]
-    inverse: NDArray[np.float64]
-    ray: NDArray[np.float64]
+    frame: Indices
+    start: Indices
+    cell: Indices
+    inverse: Floats
+    ray: Floats
     frames: int
 
-    def plane(self) -> NDArray[np.intp]:
+    def plane(self) -> Indices:
         """Plane (N,) that each cell belongs to."""
         return np.repeat(np.arange(len(self.frame)), np.diff(self.start))
 
@@ -47,7 +48,7 @@ class Sightings(NamedTuple):
         shape = len(self.cell), 3 * len(self.frame)
         return sparse.csr_array((self.ray.ravel(), columns.ravel(), pointers), shape)
 
-    def of_planes(self, chosen: NDArray[np.bool_]) -> Sightings:
+    def of_planes(self, chosen: Mask) -> Sightings:
         """Those of the planes that are chosen, (P,)."""
         cells = chosen[self.plane()]
         start = np.concatenate([[0], np.cumsum(np.diff(self.start)[chosen])])
@@ -66,7 +67,7 @@ def cell_grid(shape: tuple[int, int]) -> tuple[int, int]:
     return -(-shape[0] // size), -(-shape[1] // size)
 
 
-def find_sightings(labels: NDArray[np.uint16], image: RangeImage) -> Sightings:
+def find_sightings(labels: Labels, image: RangeImage) -> Sightings:
     """Planes of one frame with these labels (H, W), 0 for no plane.
 
     An inverse range along a unit ray is taken as the inverse depth it is.

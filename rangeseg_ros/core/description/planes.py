@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices, Labels
 from rangeseg_ros.core.description.shapes import Outline, RegionShape, Shape, triangles
 from rangeseg_ros.core.fitting.coplanar import common_surfaces
 from rangeseg_ros.core.fitting.fits import Fits
@@ -72,10 +72,10 @@ class Plane:
     label: int
     id: int
     surface: int
-    normal: NDArray[np.float64]
+    normal: Floats
     distance: float
-    covariance: NDArray[np.float64]
-    centroid: NDArray[np.float64]
+    covariance: Floats
+    centroid: Floats
     count: int
     rms: float
     confidence: float
@@ -106,7 +106,7 @@ class Plane:
             f'distance {self.distance:.4g} m, rms {1000 * self.rms:.2g} mm>'
         )
 
-    def mesh(self) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    def mesh(self) -> tuple[Floats, Indices]:
         """Vertices (N, 3), metres, and triangles (T, 3) of them, of the outline without its holes.
 
         Triangles are rows of vertices, counter-clockwise seen from the sensor.
@@ -130,7 +130,7 @@ class Plane:
         return self.shape.area
 
     @property
-    def extents(self) -> NDArray[np.float64]:
+    def extents(self) -> Floats:
         """(2,) length and width of the rectangle around the region, metres.
 
         Its sides run along the principal axes of the region's area.
@@ -138,12 +138,12 @@ class Plane:
         return self.shape.extents
 
     @property
-    def centre(self) -> NDArray[np.float64]:
+    def centre(self) -> Floats:
         """(3,) centre of that rectangle, metres."""
         return self.shape.centre
 
     @property
-    def orientation(self) -> NDArray[np.float64]:
+    def orientation(self) -> Floats:
         """(4,) quaternion x, y, z, w of the frame of that rectangle.
 
         Its x axis runs along the length, pointing to the image's right, its z axis is the normal.
@@ -151,7 +151,7 @@ class Plane:
         return quaternions(self.shape.frame)
 
     @property
-    def hull(self) -> NDArray[np.float64]:
+    def hull(self) -> Floats:
         """(N, 3) outline on the plane, metres, counter-clockwise seen from the sensor.
 
         Follows the region's largest part within `shapes.TOLERANCE` pixels; concave as it is.
@@ -159,7 +159,7 @@ class Plane:
         return self.outline.hull
 
     @property
-    def holes(self) -> list[NDArray[np.float64]]:
+    def holes(self) -> list[Floats]:
         """Outlines (N, 3) of the holes in the hull, clockwise seen from the sensor."""
         return self.outline.holes
 
@@ -171,12 +171,12 @@ def _plain(value: Any) -> Any:
 
 
 def describe_regions(
-    labels: NDArray[np.uint16],
+    labels: Labels,
     image: RangeImage,
     fits: Fits,
-    root: NDArray[np.float64],
+    root: Floats,
     sensor: SensorModel,
-    probability: NDArray[np.float64] | None = None,
+    probability: Floats | None = None,
 ) -> list[Plane]:
     """Planes of the regions 1...M of `labels` (H, W), but of those whose pixels determine none.
 
@@ -219,7 +219,7 @@ def describe_regions(
     ]
 
 
-def _described(fits: Fits, sensor: SensorModel) -> tuple[NDArray[np.float64], ...]:
+def _described(fits: Fits, sensor: SensorModel) -> tuple[Floats, ...]:
     """What regions 0...M have as planes, see `Plane`.
 
     Normal, distance, centroid, rms, confidence.
@@ -241,7 +241,7 @@ def _described(fits: Fits, sensor: SensorModel) -> tuple[NDArray[np.float64], ..
     squared = np.where(level > 0, level * level, 1.0)
     pixels = np.bincount(region, cells[:, COUNT], len(theta))
 
-    def across(variance: NDArray[np.float64]) -> NDArray[np.float64]:
+    def across(variance: Floats) -> Floats:
         total = np.bincount(region, cells[:, COUNT] * variance / squared, len(theta))
         return total / np.maximum(pixels, 1) * distance**2
 

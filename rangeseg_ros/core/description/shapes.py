@@ -13,6 +13,7 @@ from mapbox_earcut import triangulate_float64
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices, Labels, Mask, Singles
 from rangeseg_ros.core.sensing.camera import Camera
 
 # Distance of the polygon from the outline at most, pixels: what segmentation leaves open.
@@ -24,42 +25,42 @@ _CORNERS = np.ones((2, 2), np.uint8)  # the pixels that a corner belongs to
 class Outline:
     """Border of a region, put on its plane when first asked for."""
 
-    labels: NDArray[np.uint16]  # (h, w), of its bounding box
+    labels: Labels  # (h, w), of its bounding box
     label: int
     row: int  # of the box's first pixel in the image
     column: int
-    theta: NDArray[np.float64]  # plane, theta . ray = inverse range
+    theta: Floats  # plane, theta . ray = inverse range
     farthest: float  # inverse range at which a steep plane ends
     # What gives the rays: of the corners of the pixels, or (h, w, 3) of their centres (cloud).
-    rays: Camera | NDArray[np.float32]
+    rays: Camera | Singles
 
     def __getstate__(self) -> dict[str, Any]:
         # Without what it has worked out.
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @cached_property
-    def mask(self) -> NDArray[np.bool_]:
+    def mask(self) -> Mask:
         """(h, w) the region in its bounding box."""
         return self.labels == self.label
 
     @cached_property
-    def hull(self) -> NDArray[np.float64]:
+    def hull(self) -> Floats:
         """(N, 3) outer border of the largest part, counter-clockwise seen from the sensor."""
         return self._simplified(self._contours[0][self._largest])
 
     @cached_property
-    def holes(self) -> list[NDArray[np.float64]]:
+    def holes(self) -> list[Floats]:
         """Borders (N, 3) of the holes in the largest part, clockwise seen from the sensor."""
         inside = np.flatnonzero(self._contours[1] == self._largest).tolist()
         holes = [self._simplified(self._contours[0][k]) for k in inside]
         return [hole for hole in holes if len(hole) > 2]
 
     @property
-    def parts(self) -> list[list[NDArray[np.float64]]]:
+    def parts(self) -> list[list[Floats]]:
         """Hull and holes of each part: of the largest one."""
         return [[self.hull, *self.holes]]
 
-    def corners(self) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    def corners(self) -> tuple[Floats, Indices]:
         """Of all rings, place in the image and ray (N, 5), and number of the ring (N,)."""
         contours = self._contours[0]
         corners = self._rays(np.concatenate(contours))
@@ -89,17 +90,17 @@ class Outline:
         outer = np.flatnonzero(around < 0).tolist()
         return max(outer, key=lambda k: cv2.contourArea(contours[k]))
 
-    def _simplified(self, contour: NDArray[np.int32]) -> NDArray[np.float64]:
+    def _simplified(self, contour: NDArray[np.int32]) -> Floats:
         """Points (N, 3) on the plane of a contour without the corners that say little."""
         corners = np.asarray(cv2.approxPolyDP(contour, TOLERANCE, True)[:, 0], np.int32)
         rays = self._clipped(self._rays(corners))[:, 2:]
         # Of regions no wider than the tolerance, or with few corners that have a ray, all count.
         if len(rays) < 3:
             rays = self._clipped(self._rays(contour))[:, 2:]
-        points: NDArray[np.float64] = rays / (rays @ self.theta)[:, None]
+        points: Floats = rays / (rays @ self.theta)[:, None]
         return points + self.rays.place if isinstance(self.rays, Camera) else points
 
-    def _clipped(self, corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _clipped(self, corners: Floats) -> Floats:
         """A ring (N, 5) of places and rays as far as its plane counts (Sutherland and Hodgman)."""
         level = corners[:, 2:] @ self.theta - self.farthest
         # Lenses that fold the image leave corners without a ray.
@@ -114,7 +115,7 @@ class Outline:
         order = np.argsort(np.append(np.flatnonzero(kept), ends + 0.5), kind='stable')
         return np.concatenate([corners[kept], crossing])[order]
 
-    def _rays(self, corners: NDArray[np.int32]) -> NDArray[np.float64]:
+    def _rays(self, corners: NDArray[np.int32]) -> Floats:
         """Places (x, y) in the image and rays (N, 5) of corners (x, y) of pixels in the box."""
         if isinstance(self.rays, Camera):
             places = corners + np.array([self.column - 0.5, self.row - 0.5])
@@ -134,9 +135,9 @@ class Shape(NamedTuple):
     """Size and place of a region, see `Plane`; columns of `frame` are length, width, normal."""
 
     area: float
-    extents: NDArray[np.float64]
-    centre: NDArray[np.float64]
-    frame: NDArray[np.float64]
+    extents: Floats
+    centre: Floats
+    frame: Floats
 
 
 class RegionShape:
@@ -145,9 +146,7 @@ class RegionShape:
     In the frame in which the sensor is at `place` (3,) and looks with `right` (3,) to the right.
     """
 
-    def __init__(
-        self, outline: Outline, place: NDArray[np.float64], right: NDArray[np.float64]
-    ) -> None:
+    def __init__(self, outline: Outline, place: Floats, right: Floats) -> None:
         self._outline, self._place, self._right = outline, place, right
 
     @cached_property
@@ -168,9 +167,7 @@ class RegionShape:
         return Shape, self._shape
 
 
-def triangles(
-    rings: Sequence[NDArray[np.float64]], normal: NDArray[np.float64]
-) -> NDArray[np.intp]:
+def triangles(rings: Sequence[Floats], normal: Floats) -> Indices:
     """Triangles (T, 3) of a polygon with holes, as numbers of the corners of all rings (N, 3).
 
     Counter-clockwise seen from where the normal points.
@@ -186,11 +183,8 @@ def triangles(
 
 @njit(cache=True, error_model='numpy')
 def _rectangle(
-    corners: NDArray[np.float64],
-    ring: NDArray[np.intp],
-    theta: NDArray[np.float64],
-    right: NDArray[np.float64],
-) -> tuple[float, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    corners: Floats, ring: Indices, theta: Floats, right: Floats
+) -> tuple[float, Floats, Floats, Floats]:
     """Rectangle around a polygon, along the principal axes of its area, to the right.
 
     The corners are those of `Outline.corners`; holes run the other way round. Square metres of a

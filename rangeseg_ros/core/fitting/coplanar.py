@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.sensing.moments import cofactors
 from rangeseg_ros.core.significance import chi2_quantile
@@ -13,7 +13,7 @@ from rangeseg_ros.core.significance import chi2_quantile
 _LIMIT = chi2_quantile(3, 0.99)
 
 
-def common_surfaces(fits: Fits, covariance: NDArray[np.float64]) -> NDArray[np.intp]:
+def common_surfaces(fits: Fits, covariance: Floats) -> Indices:
     """Group regions whose planes differ by no more than their errors.
 
     From the largest region to the smallest, each joins the group whose largest member it agrees
@@ -27,9 +27,7 @@ def common_surfaces(fits: Fits, covariance: NDArray[np.float64]) -> NDArray[np.i
 
 
 @njit(cache=True, nogil=True)
-def _surfaces(
-    order: NDArray[np.intp], theta: NDArray[np.float64], covariance: NDArray[np.float64]
-) -> NDArray[np.intp]:
+def _surfaces(order: Indices, theta: Floats, covariance: Floats) -> Indices:
     surface = np.zeros(len(theta), np.intp)
     for rank in range(len(order)):
         k = order[rank]
@@ -44,7 +42,7 @@ def _surfaces(
 
 
 @njit(cache=True)
-def _chi_squared(difference: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
+def _chi_squared(difference: Floats, covariance: Floats) -> float:
     """Chi-squared of the difference of two planes; infinite for no covariance."""
     # A sensor without errors still rounds: to 1e-9 / m.
     a, d, f = covariance[0, 0] + 1e-18, covariance[1, 1] + 1e-18, covariance[2, 2] + 1e-18

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.sensor import FLOOR
 from rangeseg_ros.core.significance import chi2_quantile, f_quantile, quantile
@@ -35,11 +35,11 @@ class Law(NamedTuple):
     tilt: float = 0.0
     error: float = 0.0  # standard error of its deviations, as a share of these
 
-    def facing(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
+    def facing(self, squared: Floats) -> Floats:
         """Variances at these squared inverse ranges, on surfaces that face the sensor."""
         return self.quartic * squared * squared + (FLOOR + self.constant)
 
-    def variances(self, blocks: Blocks) -> NDArray[np.float64]:
+    def variances(self, blocks: Blocks) -> Floats:
         """Variances (rows, columns) of the pixels of blocks."""
         return self.facing(blocks.squared) + self.tilt * blocks.slope
 
@@ -52,13 +52,13 @@ class Law(NamedTuple):
 class Strata(NamedTuple):
     """Blocks alike in range and slope: of each range first those of the smallest slope."""
 
-    blocks: NDArray[np.intp]  # (S, N), flat indices of the blocks of each stratum
-    squared: NDArray[np.float64]  # (S,), medians of the squared inverse range
-    slope: NDArray[np.float64]  # (S,), of the slope
+    blocks: Indices  # (S, N), flat indices of the blocks of each stratum
+    squared: Floats  # (S,), medians of the squared inverse range
+    slope: Floats  # (S,), of the slope
     slopes: int  # strata of a range
 
     @classmethod
-    def of(cls, blocks: Blocks, used: NDArray[np.intp]) -> Strata:
+    def of(cls, blocks: Blocks, used: Indices) -> Strata:
         """Strata of equal sizes of the blocks that are `used` (N,), but for a few left out."""
         squared, slope = blocks.squared.ravel()[used], blocks.slope.ravel()[used]
         slopes = _SLOPES if len(used) >= _SLOPES * _PER_STRATUM else 1
@@ -71,14 +71,12 @@ class Strata(NamedTuple):
         medians = quantile(squared[order], 0.5), quantile(slope[order], 0.5)
         return cls(used[order], *medians, slopes)
 
-    def medians(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def medians(self, values: Floats) -> Floats:
         """Median (S,) of the values of all blocks (rows, columns) in each stratum."""
         return quantile(values.ravel()[self.blocks], 0.5)
 
 
-def fit_law(
-    strata: Strata, shown: NDArray[np.float64], known: NDArray[np.float64], like: Law
-) -> Law:
+def fit_law(strata: Strata, shown: Floats, known: Floats, like: Law) -> Law:
     """The law that with what is `known` explains the variances (S,) that strata show.
 
     Constant in disparity or, if that explains them better, in range: of both together a few
@@ -108,9 +106,7 @@ def fit_law(
 
 
 @njit(cache=True, nogil=True)
-def _scale_term(
-    term: NDArray[np.float64], shown: NDArray[np.float64], known: NDArray[np.float64]
-) -> tuple[float, float]:
+def _scale_term(term: Floats, shown: Floats, known: Floats) -> tuple[float, float]:
     """Factor >= 0 of a term (S,) that with what is `known` explains variances (S,).
 
     Variances that are shown are spread in proportion to themselves (chi-squared): the likeliest
@@ -128,6 +124,6 @@ def _scale_term(
 
 
 @njit(cache=True, nogil=True)
-def _deviance(explained: NDArray[np.float64], shown: NDArray[np.float64]) -> float:
+def _deviance(explained: Floats, shown: Floats) -> float:
     """How unlikely variances (S,) are where such (S,) are expected, but for a constant."""
     return float((np.log(explained) + shown / explained).sum())

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Labels, Mask
 from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER, RegionSums, fit_sums, sum_regions
 from rangeseg_ros.core.fitting.uncertainty import covariance_roots, levels
 from rangeseg_ros.core.sensing.blocks import Blocks
@@ -26,18 +26,14 @@ class Fits(NamedTuple):
     """
 
     sums: RegionSums
-    total: NDArray[np.float64]
-    theta: NDArray[np.float64]
+    total: Floats
+    theta: Floats
     sensor: SensorModel
-    level: NDArray[np.float64]
+    level: Floats
 
     @classmethod
     def of(
-        cls,
-        labels: NDArray[np.uint16],
-        image: RangeImage,
-        sensor: SensorModel,
-        blocks: Blocks | None = None,
+        cls, labels: Labels, image: RangeImage, sensor: SensorModel, blocks: Blocks | None = None
     ) -> Fits:
         """Fit a plane to every region.
 
@@ -53,30 +49,28 @@ class Fits(NamedTuple):
             theta = _total_least_squares(total, theta)
         return cls(sums, total, theta, sensor, levels(sums, theta))
 
-    def without(self, dropped: NDArray[np.bool_]) -> Fits:
+    def without(self, dropped: Mask) -> Fits:
         """Those of regions that are not `dropped` (M + 1,), never 0, numbered anew."""
         kept, sums = ~dropped, self.sums.without(dropped)
         level = self.level[kept[self.sums.owners]]
         return Fits(sums, self.total[kept], self.theta[kept], self.sensor, level)
 
-    def farthest(self) -> NDArray[np.float64]:
+    def farthest(self) -> Floats:
         """Least inverse range (M + 1,) of planes in their regions; 0 or less where none ends."""
         least = np.where(np.diff(self.sums.start) > 0, np.inf, 0.0)
         np.minimum.at(least, self.sums.owners, self.level)
         return least
 
-    def roots(self) -> NDArray[np.float64]:
+    def roots(self) -> Floats:
         """Roots (M + 1, 3, 3) of the covariances of the planes, zeros where there is none."""
-        known: NDArray[np.bool_] = np.asarray(self.theta.any(axis=1))
+        known: Mask = np.asarray(self.theta.any(axis=1))
         *entries, determinant = cofactors(*self.total[:, :6].T)
         inverse = np.stack(entries, axis=1)[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]]
         inverse = np.where(known[:, None], inverse, 0) / np.where(known, determinant, 1)[:, None]
         return covariance_roots(self.sums, self.level, inverse.reshape(-1, 3, 3), self.sensor)
 
 
-def _total_least_squares(
-    total: NDArray[np.float64], theta: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _total_least_squares(total: Floats, theta: Floats) -> Floats:
     """Planes of the smallest mean square distance, in the place of those that `theta` has."""
     count = np.maximum(total[:, COUNT], 1)
     mean = total[:, POINT:SCATTER] / count[:, None]

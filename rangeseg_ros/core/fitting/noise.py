@@ -10,8 +10,8 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices, Singles
 from rangeseg_ros.core.fitting.error_law import Law, Strata, fit_law
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, sum_of_four
 from rangeseg_ros.core.sensing.moments import COUNT
@@ -105,12 +105,7 @@ def measured_sensor(
 
 
 def _over_scales(
-    rays: NDArray[np.float32],
-    blocks: Blocks,
-    coarse: Blocks,
-    noise: Law,
-    least: Law,
-    prior: SensorModel,
+    rays: Singles, blocks: Blocks, coarse: Blocks, noise: Law, least: Law, prior: SensorModel
 ) -> tuple[list[float], float, float, Law, float] | None:
     """What blocks of 4, 8, 16, ... pixels show, as long as there are enough of them.
 
@@ -169,20 +164,18 @@ def _over_scales(
     return within, between, filled, distortion, unbent if CLEARLY * unbent < 1 else 1.0
 
 
-def _some(used: NDArray[np.intp], most: int) -> NDArray[np.intp]:
+def _some(used: Indices, most: int) -> Indices:
     """Every n-th of N numbers: about as many as `most`."""
     # Odd, as rows of blocks are rarely odd: not the same columns of every row.
     return used[:: max(len(used) // most, 1) | 1]
 
 
-def _median(values: NDArray[np.float64], used: NDArray[np.intp]) -> float:
+def _median(values: Floats, used: Indices) -> float:
     """Median of the values (rows, columns) of blocks of these flat indices (N,)."""
     return float(quantile(values.ravel()[used], 0.5))
 
 
-def _ratio(
-    blocks: Blocks, level: NDArray[np.float64], used: NDArray[np.intp], strata: Strata
-) -> float:
+def _ratio(blocks: Blocks, level: Floats, used: Indices, strata: Strata) -> float:
     """What blocks of these flat indices (N,) show of the variances `level` (rows, columns)."""
     freedom = np.maximum(blocks.moments[..., COUNT] - 3, 1)
     ratio = blocks.residual / (level * freedom)
@@ -225,7 +218,7 @@ def _random(within: list[float], between: float, filled: float) -> tuple[float, 
     return float(total), float(white[best] / total), _WIDTHS[best]
 
 
-def quantisation(inverse: NDArray[np.float32]) -> tuple[float, float]:
+def quantisation(inverse: Singles) -> tuple[float, float]:
     """Steps of the inverse range, 1/m, and of the range, metres, that an image is rounded to.
 
     Of inverse ranges (H, W), 0 where nothing was measured. One of the steps at most is not 0.
@@ -246,7 +239,7 @@ def quantisation(inverse: NDArray[np.float32]) -> tuple[float, float]:
     return (quantum, 0.0) if clear > range_clear else (0.0, range_quantum)
 
 
-def _common_step(steps: NDArray[np.float64]) -> tuple[float, float]:
+def _common_step(steps: Floats) -> tuple[float, float]:
     """The step of which the smaller ones of these are multiples, and how clearly they are."""
     small = quantile(steps, _SMALLEST)
     # What was rounded twice is off by a little.

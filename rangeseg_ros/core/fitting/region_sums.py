@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices, Labels, Mask, Singles
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.moments import (
     CHI2,
@@ -38,13 +39,13 @@ p (3), p p^T (6), and v, u, v^2, u^2 (4) of the row v and the column u; their nu
 class Layout(NamedTuple):
     """Cells of regions 0...M; region 0 has none."""
 
-    box: NDArray[np.intp]  # (M + 1, 4), first row and column, those after the last; or zeros
-    side: NDArray[np.intp]  # (M + 1,), blocks along the side of a cell
-    columns: NDArray[np.intp]  # (M + 1,), cells side by side
-    start: NDArray[np.intp]  # (M + 2,), where each region's cells begin
+    box: Indices  # (M + 1, 4), first row and column, those after the last; or zeros
+    side: Indices  # (M + 1,), blocks along the side of a cell
+    columns: Indices  # (M + 1,), cells side by side
+    start: Indices  # (M + 2,), where each region's cells begin
 
     @classmethod
-    def of(cls, labels: NDArray[np.uint16]) -> Layout:
+    def of(cls, labels: Labels) -> Layout:
         """Cells of whole blocks for the regions of labels (H, W), as small as may be."""
         box = find_boxes(labels, int(labels.max(initial=0)) + 1)
         first, after = box[:, :2], box[:, 2:]
@@ -60,18 +61,18 @@ class Layout(NamedTuple):
 class RegionSums(NamedTuple):
     """Sums over regions 0...M, without outliers."""
 
-    box: NDArray[np.intp]  # (M + 1, 4), see `Layout`
-    start: NDArray[np.intp]  # (M + 2,), where each region's cells begin in `cells`
-    cells: NDArray[np.float64]  # (N, 29), those with pixels, see `RECORD`
-    pixels: NDArray[np.intp]  # (M + 1,), number of measured pixels
-    outliers: NDArray[np.intp]  # (M + 1,), and of those that were left out
+    box: Indices  # (M + 1, 4), see `Layout`
+    start: Indices  # (M + 2,), where each region's cells begin in `cells`
+    cells: Floats  # (N, 29), those with pixels, see `RECORD`
+    pixels: Indices  # (M + 1,), number of measured pixels
+    outliers: Indices  # (M + 1,), and of those that were left out
 
     @property
-    def owners(self) -> NDArray[np.intp]:
+    def owners(self) -> Indices:
         """Region (N,) of each cell."""
         return regions_of(self.start)
 
-    def without(self, dropped: NDArray[np.bool_]) -> RegionSums:
+    def without(self, dropped: Mask) -> RegionSums:
         """Those of regions that are not `dropped` (M + 1,), numbered anew."""
         kept, length = ~dropped, np.diff(self.start)
         start = np.concatenate([[0], np.cumsum(length[kept])])
@@ -80,8 +81,8 @@ class RegionSums(NamedTuple):
 
 
 def sum_regions(
-    labels: NDArray[np.uint16], image: RangeImage, blocks: Blocks, sensor: SensorModel
-) -> tuple[RegionSums, NDArray[np.float64]]:
+    labels: Labels, image: RangeImage, blocks: Blocks, sensor: SensorModel
+) -> tuple[RegionSums, Floats]:
     """Sums over the pixels of regions (H, W), but for outliers from their least-squares planes.
 
     Outliers are beyond four standard deviations of the sensor's errors from the plane of the
@@ -109,18 +110,18 @@ def sum_regions(
     return RegionSums(layout.box, start, cells[kept], measured, outliers), total
 
 
-def fit_sums(total: NDArray[np.float64]) -> NDArray[np.float64]:
+def fit_sums(total: Floats) -> Floats:
     """Least-squares planes theta . ray = inverse range (M + 1, 3); zeros where there is none."""
     return np.where(total[:, COUNT, None] >= 3, fit_all(total)[0], 0)
 
 
-def regions_of(start: NDArray[np.intp]) -> NDArray[np.intp]:
+def regions_of(start: Indices) -> Indices:
     """Region (N,) of each cell, where those of regions 0...M begin at `start` (M + 2,)."""
     return np.repeat(np.arange(len(start) - 1), np.diff(start))
 
 
 @njit(cache=True, nogil=True)
-def find_boxes(labels: NDArray[np.integer], count: int) -> NDArray[np.intp]:
+def find_boxes(labels: NDArray[np.integer], count: int) -> Indices:
     """Bounding boxes (count, 4) of regions 1...count - 1, see `Layout`."""
     height, width = labels.shape
     box = np.zeros((count, 4), np.intp)
@@ -141,7 +142,7 @@ def find_boxes(labels: NDArray[np.integer], count: int) -> NDArray[np.intp]:
 
 
 @njit(cache=True, nogil=True)
-def _labels_of_blocks(labels: NDArray[np.uint16]) -> NDArray[np.int32]:
+def _labels_of_blocks(labels: Labels) -> NDArray[np.int32]:
     """Labels (rows, columns) of all pixels of each block; -1 where they have several."""
     height, width = labels.shape
     result = np.empty((-(-height // BLOCK), -(-width // BLOCK)), np.int32)
@@ -166,18 +167,18 @@ def _cell_of(layout: Layout, label: int, bi: int, bj: int) -> int:
 
 @njit(cache=True, nogil=True)
 def _accumulate(
-    labels: NDArray[np.uint16],
+    labels: Labels,
     inside: NDArray[np.int32],
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
+    inverse: Singles,
+    rays: Singles,
     pinhole: bool,
     central: bool,
-    axis: NDArray[np.float64],
+    axis: Floats,
     blocks: Blocks,
     sensor: SensorModel,
     layout: Layout,
-    theta: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    theta: Floats,
+) -> Floats:
     """Sums (2, N, 29) over the pixels of regions: of inliers of `theta`, of outliers.
 
     Of regions whose plane (M + 1, 3) is zero there are no outliers.
@@ -223,12 +224,7 @@ def _accumulate(
 
 @njit(cache=True, inline='always')
 def _add_pixel(
-    record: NDArray[np.float64],
-    i: float,
-    j: float,
-    ray: tuple[float, float, float],
-    y: float,
-    weight: float,
+    record: Floats, i: float, j: float, ray: tuple[float, float, float], y: float, weight: float
 ) -> None:
     """Add a pixel to a cell."""
     x0, x1, x2 = float(ray[0]), float(ray[1]), float(ray[2])
@@ -248,11 +244,11 @@ def _add_pixel(
 
 @njit(cache=True, inline='always')
 def _add_block(
-    record: NDArray[np.float64],
-    moments: NDArray[np.float64],
+    record: Floats,
+    moments: Floats,
     squared: float,
     sensor: SensorModel,
-    axis: NDArray[np.float64],
+    axis: Floats,
     middle: tuple[float, float],
 ) -> None:
     """Add a block, of moments with unit weights, to a cell: rays are 1 long along `axis`."""

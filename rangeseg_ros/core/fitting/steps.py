@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Singles
 from rangeseg_ros.core.fitting.noise import ROUGH
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.moments import COUNT
@@ -20,9 +20,9 @@ class Steps(NamedTuple):
     Of a block that is not flat, by what is known of the flat ones beside it.
     """
 
-    windows: NDArray[np.float32]  # between means of windows: that of the flattest surface
-    pixels: NDArray[np.float32]  # between pixels, which may be any surface's: of the noisiest
-    slopes: NDArray[np.float32]  # change from pixel to pixel on the flattest surface
+    windows: Singles  # between means of windows: that of the flattest surface
+    pixels: Singles  # between pixels, which may be any surface's: of the noisiest
+    slopes: Singles  # change from pixel to pixel on the flattest surface
 
 
 def jump_steps(blocks: Blocks, sensor: SensorModel) -> Steps:

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.fitting.region_sums import PLACE, RAY, WEIGHT, RegionSums
 from rangeseg_ros.core.sensing.moments import COUNT, sum_by_label
 from rangeseg_ros.core.sensing.sensor import FLOOR, SensorModel, random_variance
@@ -22,8 +22,8 @@ _ROW, _COLUMN, _FULL = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2), (0, 1, 2, 1, 3, 4
 
 
 def covariance_roots(
-    sums: RegionSums, level: NDArray[np.float64], inverse: NDArray[np.float64], sensor: SensorModel
-) -> NDArray[np.float64]:
+    sums: RegionSums, level: Floats, inverse: Floats, sensor: SensorModel
+) -> Floats:
     """Roots (M + 1, 3, 3) of the covariances of planes theta . ray = inverse range of regions.
 
     `level` (N,) are the inverse ranges of cells on them, see `levels`, and `inverse`
@@ -47,14 +47,14 @@ def covariance_roots(
     return roots(inverse, middle)
 
 
-def levels(sums: RegionSums, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+def levels(sums: RegionSums, theta: Floats) -> Floats:
     """Inverse ranges (N,) of the planes of regions at the middles of their cells."""
     plane, rays = theta[sums.owners], sums.cells[:, RAY : RAY + 3]
-    total: NDArray[np.float64] = (plane * rays).sum(axis=1)
+    total: Floats = (plane * rays).sum(axis=1)
     return total / sums.cells[:, WEIGHT]
 
 
-def roots(outer: NDArray[np.float64], middle: NDArray[np.float64]) -> NDArray[np.float64]:
+def roots(outer: Floats, middle: Floats) -> Floats:
     """R (N, m, 3) with R R^T = outer middle outer^T, of `outer` (N, m, 3) and `middle` (N, 3, 3).
 
     So no rounding that `outer` magnifies makes a variance negative. What rounding has made of
@@ -64,7 +64,7 @@ def roots(outer: NDArray[np.float64], middle: NDArray[np.float64]) -> NDArray[np
 
 
 @njit(cache=True, nogil=True)
-def _cholesky(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+def _cholesky(matrices: Floats) -> Floats:
     """Lower triangles L (N, 3, 3) with L L^T the matrices."""
     factor = np.zeros_like(matrices)
     for k in range(len(matrices)):
@@ -80,15 +80,13 @@ def _cholesky(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
     return factor
 
 
-def squares(root: NDArray[np.float64]) -> NDArray[np.float64]:
+def squares(root: Floats) -> Floats:
     """Covariances R R^T, (N, m, m), of roots R (N, m, 3)."""
-    result: NDArray[np.float64] = (root[:, :, None] * root[:, None]).sum(axis=3)
+    result: Floats = (root[:, :, None] * root[:, None]).sum(axis=3)
     return result
 
 
-def plane_jacobians(
-    normal: NDArray[np.float64], distance: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def plane_jacobians(normal: Floats, distance: Floats) -> Floats:
     """Derivative (N, 4, 3) of (normal, distance) by theta = -normal / distance."""
     tangent = np.eye(3) - normal[:, :, None] * normal[:, None]
     along = distance[:, None, None] ** 2 * normal[:, None]
@@ -97,13 +95,8 @@ def plane_jacobians(
 
 @njit(cache=True, nogil=True)
 def _halves(
-    sums: RegionSums,
-    level: NDArray[np.float64],
-    place: NDArray[np.float64],
-    width: float,
-    constant: float,
-    quartic: float,
-) -> NDArray[np.float64]:
+    sums: RegionSums, level: Floats, place: Floats, width: float, constant: float, quartic: float
+) -> Floats:
     """Halves of the sums over pairs of pixels (M + 1, 3, 3) of regions: but for the transposes.
 
     Of a Gaussian field that looks smoothed with a kernel of this width, pixels, and has the

@@ -25,6 +25,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Mask
+
 # Parents that are not a neighbour: those have the number of their side, 0 to 3.
 _TERMINAL, _ORPHAN, _FREE = 4, 5, 6
 
@@ -36,20 +38,18 @@ class _Flow(NamedTuple):
     """
 
     neighbour: NDArray[np.int32]  # (n, 4), node on each side, -1 for none
-    residual: NDArray[np.float64]  # (n, 4), what the edge to that side can still take
-    terminal: NDArray[np.float64]  # (n,), that of the source, of the sink where negative
+    residual: Floats  # (n, 4), what the edge to that side can still take
+    terminal: Floats  # (n,), that of the source, of the sink where negative
     parent: NDArray[np.int8]  # (n,), side of the parent in its tree
-    sink: NDArray[np.bool_]  # (n,), whether the tree is that of the sink
+    sink: Mask  # (n,), whether the tree is that of the sink
     stamp: NDArray[np.int32]  # (n,), when the distance to the terminal was last known
     depth: NDArray[np.int32]  # (n,), that distance
     queue: NDArray[np.int32]  # (n,), ring of the nodes from which the trees grow
-    queued: NDArray[np.bool_]  # (n,), whether a node is in it
+    queued: Mask  # (n,), whether a node is in it
 
 
 @njit(cache=True, nogil=True)
-def minimum_cut(
-    excess: NDArray[np.float64], neighbour: NDArray[np.int32], link: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def minimum_cut(excess: Floats, neighbour: NDArray[np.int32], link: Floats) -> Mask:
     """Choice x (n,) bool that minimises sum excess x + sum link |x - x of the neighbour|.
 
     Of several, the one that chooses fewest nodes. `excess` (n,) is the cost of choosing a node, of

@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Mask, Singles
 from rangeseg_ros.core.graphcut.cut import minimum_cut
 from rangeseg_ros.core.sensing.grid import Grid
 
@@ -27,26 +28,20 @@ class GridLabelling(NamedTuple):
     """A labelling of n pixels, in raster order, while expansions change it."""
 
     labels: NDArray[np.int32]  # (n,)
-    data: NDArray[np.float32]  # (n,), data cost of each pixel's label
-    links: NDArray[np.float32]  # (2, n), see `link_costs`
+    data: Singles  # (n,), data cost of each pixel's label
+    links: Singles  # (2, n), see `link_costs`
     width: int  # pixels in a row
     position: NDArray[np.int32]  # (n,), scratch of the expansions: -1 between them
 
     @classmethod
     def of(
-        cls,
-        labels: NDArray[np.int32],
-        data: NDArray[np.float32],
-        links: NDArray[np.float32],
-        width: int,
+        cls, labels: NDArray[np.int32], data: Singles, links: Singles, width: int
     ) -> GridLabelling:
         """Begin with these labels and data costs, which change in place."""
         return cls(labels, data, links, width, np.full(len(labels), -1, np.int32))
 
 
-def energy(
-    data: NDArray[np.floating], labels: NDArray[np.integer], links: NDArray[np.float32]
-) -> float:
+def energy(data: NDArray[np.floating], labels: NDArray[np.integer], links: Singles) -> float:
     """Value of E for labels (H, W) of data costs (H, W), with `link_costs` of the grid."""
     right, below = links.reshape(2, *labels.shape)
     border = right[:, :-1][labels[:, 1:] != labels[:, :-1]].sum(dtype=float)
@@ -54,7 +49,7 @@ def energy(
     return float(data.sum(dtype=float) + border)
 
 
-def link_costs(grid: Grid, smoothness: float) -> NDArray[np.float32]:
+def link_costs(grid: Grid, smoothness: float) -> Singles:
     """Lambda u of every edge of a grid (H, W), in the order of the sites; lambda = `smoothness`.
 
     (2, H * W): of each pixel's edges to the right and down, 0 at the border. The edge between p
@@ -70,9 +65,7 @@ def link_costs(grid: Grid, smoothness: float) -> NDArray[np.float32]:
 
 
 def minimise(
-    labelling: GridLabelling,
-    count: int,
-    cost: Callable[[int, NDArray[np.int32]], NDArray[np.float32]],
+    labelling: GridLabelling, count: int, cost: Callable[[int, NDArray[np.int32]], Singles]
 ) -> None:
     """Expand each of `count` labels over all sites until none helps (listing 4.1); in place.
 
@@ -89,11 +82,7 @@ def minimise(
 
 @njit(cache=True, nogil=True)
 def expand(
-    alpha: int,
-    sites: NDArray[np.int32],
-    new: NDArray[np.float32],
-    labelling: GridLabelling,
-    least: float,
+    alpha: int, sites: NDArray[np.int32], new: Singles, labelling: GridLabelling, least: float
 ) -> bool:
     """Give label `alpha` to the best set of sites (s,), none of which has it; in place.
 
@@ -112,12 +101,7 @@ def expand(
 
 
 @njit(cache=True, nogil=True)
-def change(
-    switch: NDArray[np.bool_],
-    excess: NDArray[np.float64],
-    neighbour: NDArray[np.int32],
-    link: NDArray[np.float64],
-) -> float:
+def change(switch: Mask, excess: Floats, neighbour: NDArray[np.int32], link: Floats) -> float:
     """What the energy changes by where sites (s,) `switch`; the others as of `minimum_cut`."""
     value = 0.0
     for s in range(len(switch)):
@@ -132,8 +116,8 @@ def change(
 
 @njit(cache=True, nogil=True)
 def switching(
-    alpha: int, sites: NDArray[np.int32], new: NDArray[np.float32], labelling: GridLabelling
-) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.float64]]:
+    alpha: int, sites: NDArray[np.int32], new: Singles, labelling: GridLabelling
+) -> tuple[Floats, NDArray[np.int32], Floats]:
     """What switching costs each site more than staying, and its edges to other sites.
 
     (s,), and neighbours and weights as of `minimum_cut`. Clears `labelling.position`.

@@ -18,6 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Mask, Singles
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import cofactors, ray_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -66,16 +67,16 @@ class Cells(NamedTuple):
     noise.
     """
 
-    ray: NDArray[np.float32]
-    inverse: NDArray[np.float32]
-    place: NDArray[np.float32]
-    error: NDArray[np.float32]
-    variance: NDArray[np.float64]
+    ray: Singles
+    inverse: Singles
+    place: Singles
+    error: Singles
+    variance: Floats
     size: CellSize
-    axes: NDArray[np.float64]
+    axes: Floats
 
 
-def axes_of(up: NDArray[np.float64]) -> NDArray[np.float64]:
+def axes_of(up: Floats) -> Floats:
     """(3, 3) up and two horizontal directions, the first along the optical axis if it can be."""
     axis = np.array([0.0, 0.0, 1.0]) if abs(up[2]) < 0.9 else np.array([0.0, -1.0, 0.0])
     ahead = axis - (axis @ up) * up
@@ -83,7 +84,7 @@ def axes_of(up: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([up, ahead, np.cross(up, ahead)])
 
 
-def cells_of(image: RangeImage, up: NDArray[np.float64], sensor: SensorModel) -> Cells:
+def cells_of(image: RangeImage, up: Floats, sensor: SensorModel) -> Cells:
     """Cells of an image; `up` (3,) is a unit vector in its frame."""
     size, axes = CellSize.for_image(image.shape), axes_of(up)
     shape = -(-image.shape[0] // size.rows), -(-image.shape[1] // size.columns)
@@ -109,13 +110,13 @@ def cells_of(image: RangeImage, up: NDArray[np.float64], sensor: SensorModel) ->
 def _means(
     first: int,
     after: int,
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
+    inverse: Singles,
+    rays: Singles,
     pinhole: bool,
     size: CellSize,
-    ray: NDArray[np.float32],
-    mean: NDArray[np.float32],
-    scatter: NDArray[np.float32],
+    ray: Singles,
+    mean: Singles,
+    scatter: Singles,
 ) -> None:
     """Of rows first...after of cells: mean ray, mean inverse range, and the scatter of that.
 
@@ -155,28 +156,26 @@ def _means(
 class GroundField(NamedTuple):
     """The ground continued, by planes of cells: theta (3, rows, columns) . ray = inverse range."""
 
-    theta: NDArray[np.float32]
+    theta: Singles
     size: CellSize
-    up: NDArray[np.float64]
+    up: Floats
 
     def turned(self) -> GroundField:
         """Of the image with rows and columns exchanged."""
         theta = np.ascontiguousarray(self.theta.transpose(0, 2, 1))
         return GroundField(theta, CellSize(self.size.columns, self.size.rows), self.up)
 
-    def heights(self, cells: Cells) -> NDArray[np.float32]:
+    def heights(self, cells: Cells) -> Singles:
         """Heights (rows, columns) of cells above the ground, metres; NaN where not measured."""
         along = (self.theta * cells.ray).sum(axis=0)
         with np.errstate(divide='ignore', invalid='ignore'):
             below = cells.inverse * np.tensordot(self.up.astype(np.float32), self.theta, 1)
-            heights: NDArray[np.float32] = (along - cells.inverse) / below
+            heights: Singles = (along - cells.inverse) / below
         heights[cells.inverse == 0] = np.nan
         return heights
 
 
-def ground_field(
-    cells: Cells, ground: NDArray[np.bool_], base: NDArray[np.float64]
-) -> GroundField:
+def ground_field(cells: Cells, ground: Mask, base: Floats) -> GroundField:
     """The ground continued, from its cells (rows, columns) and the plane (3,) under the robot."""
     sums = _sums(cells.ray, cells.inverse, ground)
     whole = _fitted(sums.sum(axis=(1, 2), keepdims=True), base)
@@ -189,9 +188,7 @@ def ground_field(
 
 
 @njit(cache=True, nogil=True)
-def _sums(
-    ray: NDArray[np.float32], inverse: NDArray[np.float32], ground: NDArray[np.bool_]
-) -> NDArray[np.float64]:
+def _sums(ray: Singles, inverse: Singles, ground: Mask) -> Floats:
     """Sums (2, M, N, 9) over blocks, of the ground and of all that is measured.
 
     They are those of the regression: ray ray^T (xx, xy, xz, yy, yz, zz) and ray * inverse.
@@ -212,7 +209,7 @@ def _sums(
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def _fitted(sums: NDArray[np.float64], p: NDArray[np.float64]) -> NDArray[np.float64]:
+def _fitted(sums: Floats, p: Floats) -> Floats:
     """Planes (M, N, 3) that fit the ground in windows of 3 x 3 blocks and all rays on plane p."""
     _, rows, columns, _ = sums.shape
     theta = np.empty((rows, columns, 3))
@@ -241,8 +238,8 @@ def _fitted(sums: NDArray[np.float64], p: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def classify(
-    image: RangeImage, field: GroundField, bounds: NDArray[np.float32]
-) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    image: RangeImage, field: GroundField, bounds: Singles
+) -> tuple[NDArray[np.uint8], Singles]:
     """Class, 0 where not measured, and height above the ground, metres, of every pixel (H, W).
 
     By `bounds` (3, rows, columns) of the cells, metres: up to the first off the ground a pixel is
@@ -261,15 +258,15 @@ def classify(
 def _classify(
     first: int,
     after: int,
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
+    inverse: Singles,
+    rays: Singles,
     pinhole: bool,
-    theta: NDArray[np.float32],
-    rise: NDArray[np.float32],
+    theta: Singles,
+    rise: Singles,
     size: CellSize,
-    bounds: NDArray[np.float32],
+    bounds: Singles,
     classes: NDArray[np.uint8],
-    heights: NDArray[np.float32],
+    heights: Singles,
 ) -> None:
     """Of rows first...after of cells."""
     height, width = inverse.shape

@@ -12,8 +12,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.config import Config
 
 # Metres of ground, from where it begins, that are continued to below the camera: each doubles the
@@ -30,7 +30,7 @@ class Stand(NamedTuple):
     probability that the ground seen is the one it stands on; and what contradicts, in words.
     """
 
-    theta: NDArray[np.float64]
+    theta: Floats
     confidence: float
     reasons: tuple[str, ...] = ()
 
@@ -39,7 +39,7 @@ class Stand(NamedTuple):
         """Whether the ground is known."""
         return bool(self.theta.any())
 
-    def height(self, up: NDArray[np.float64]) -> float:
+    def height(self, up: Floats) -> float:
         """Of the sensor above the ground below it, along `up`, metres; NaN without a ground."""
         return float(-1 / (self.theta @ up)) if self.found else float('nan')
 
@@ -67,9 +67,7 @@ def no_step(a: float, sd: float, least: float) -> float:
     return same / (same + step) if same > 0 else 0.0
 
 
-def continued(
-    place: NDArray[np.float64], variance: NDArray[np.float64], height_sd: float, config: Config
-) -> Continuation:
+def continued(place: Floats, variance: Floats, height_sd: float, config: Config) -> Continuation:
     """The ground seen, continued to below the camera by the scale at which it agrees best.
 
     `place` (3, N) of cells of the ground is height above the stated ground and horizontal

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Singles
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN, axes_of
 from rangeseg_ros.core.ground.terrain import CellTerrain, Terrain
@@ -46,12 +47,12 @@ class GroundGrid(NamedTuple):
     """
 
     classes: NDArray[np.uint8]
-    height: NDArray[np.float32]
-    variance: NDArray[np.float32]
-    age: NDArray[np.float32]
+    height: Singles
+    variance: Singles
+    age: Singles
     resolution: float
-    origin: NDArray[np.float64]
-    orientation: NDArray[np.float64]
+    origin: Floats
+    orientation: Floats
     frame: str
 
     def __repr__(self) -> str:
@@ -97,10 +98,10 @@ class GroundMemory:
     def add(
         self,
         terrain: Terrain,
-        up: NDArray[np.float64],
+        up: Floats,
         stamp: int,
-        place: NDArray[np.float64],
-        pose: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
+        place: Floats,
+        pose: tuple[Floats, Floats] | None,
         frame: str = '',
     ) -> GroundGrid:
         """The grid with the terrain of an image taken at `stamp`, nanoseconds.
@@ -139,11 +140,11 @@ class GroundMemory:
             frame if fixed else '',
         )
 
-    def _cells_of(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
+    def _cells_of(self, points: Floats) -> NDArray[np.int64]:
         """Numbers (..., 2) of the cells of points."""
         return np.floor(points[..., :2] / self.config.grid_resolution).astype(np.int64)
 
-    def _move_to(self, centre: NDArray[np.float64]) -> None:
+    def _move_to(self, centre: Floats) -> None:
         """Have the grid around a place; what leaves it is forgotten."""
         before, kept = self._corner, self._layers
         self._forget_grid()
@@ -155,9 +156,7 @@ class GroundMemory:
         new = slice(max(-y, 0), count + min(-y, 0)), slice(max(-x, 0), count + min(-x, 0))
         self._layers[(slice(None), *new)] = kept[(slice(None), *old)]
 
-    def _count(
-        self, kind: int, points: NDArray[np.float64], errors: NDArray[np.float64], seconds: float
-    ) -> None:
+    def _count(self, kind: int, points: Floats, errors: Floats, seconds: float) -> None:
         """Add points (N, 3) of the ground, or of a kind of danger; variances (N,) of heights."""
         odds, height, variance, danger, seen = (layer.reshape(-1) for layer in self._layers)
         count = self._layers.shape[1]
@@ -184,9 +183,7 @@ class GroundMemory:
         variance[hit] = np.where(anew, square, (1 - gain) * before)
 
 
-def _evidence(
-    cells: CellTerrain, config: Config
-) -> list[tuple[int, NDArray[np.float64], NDArray[np.float64]]]:
+def _evidence(cells: CellTerrain, config: Config) -> list[tuple[int, Floats, Floats]]:
     """Classes, points (N, 3) on axes ahead, left, up, metres, and the variances of their heights.
 
     Ground first, so that danger in the same cell counts more; far away its rows are far apart,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Indices, Mask, Singles
 from rangeseg_ros.core.description.shapes import TOLERANCE
 from rangeseg_ros.core.ground.cells import DROP, GROUND
 from rangeseg_ros.core.ground.terrain import Terrain
@@ -16,7 +16,7 @@ from rangeseg_ros.core.sensing.range_image import RangeImage
 MOST_POINTS = 20_000
 
 
-def points_of_class(image: RangeImage, terrain: Terrain, kind: int) -> NDArray[np.float32]:
+def points_of_class(image: RangeImage, terrain: Terrain, kind: int) -> Singles:
     """Points (N, 4) of the pixels of a class: x, y, z and height above the ground, metres.
 
     In the frame of the image (H, W), in the order of the pixels; `kind` is `GROUND`, say.
@@ -32,9 +32,7 @@ def points_of_class(image: RangeImage, terrain: Terrain, kind: int) -> NDArray[n
     return points
 
 
-def thinned(
-    points: NDArray[np.float32], resolution: float, most: int = MOST_POINTS
-) -> NDArray[np.float32]:
+def thinned(points: Singles, resolution: float, most: int = MOST_POINTS) -> Singles:
     """One of the points (N, K), that begin with x, y, z, of each cube that has any.
 
     Cubes have sides of `resolution` metres, 0 for all points, and ones twice, four times, ... as
@@ -53,12 +51,12 @@ def thinned(
         cubes >>= 1  # twice as large
 
 
-def drops(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
+def drops(image: RangeImage, terrain: Terrain) -> Singles:
     """Where the rays that end in a drop cross the ground continued, as `_crossings`."""
     return _crossings(image.rays, image, terrain, terrain.classes == DROP)
 
 
-def unseen(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
+def unseen(image: RangeImage, terrain: Terrain) -> Singles:
     """Crossings of rays without a measurement, as `_crossings`.
 
     As far as ground is seen, reached or not, and not nearer: no sensor sees below its own nearest
@@ -83,12 +81,12 @@ def unseen(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
 
 
 def _crossings(
-    rays: NDArray[np.float32],
+    rays: Singles,
     image: RangeImage,
     terrain: Terrain,
-    where: NDArray[np.bool_],
+    where: Mask,
     bounds: tuple[float, float] = (0.0, np.inf),
-) -> NDArray[np.float32]:
+) -> Singles:
     """Points (N, 4) where rays (H, W, 3) cross the ground continued, of the pixels `where`.
 
     x, y, z in the frame of the image, metres, and the height of what was measured along the ray,
@@ -103,12 +101,8 @@ def _crossings(
 
 
 def _cross(
-    rays: NDArray[np.float32],
-    image: RangeImage,
-    terrain: Terrain,
-    rows: NDArray[np.intp],
-    columns: NDArray[np.intp],
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    rays: Singles, image: RangeImage, terrain: Terrain, rows: Indices, columns: Indices
+) -> tuple[Singles, Singles]:
     """Where rays meet the ground (N, 3), and their inverse range there, > 0 where they do."""
     theta, size = terrain.field.theta, terrain.field.size
     rays = rays[rows, columns]
@@ -118,7 +112,7 @@ def _cross(
     return points.astype(np.float32), inverse
 
 
-def outlines(image: RangeImage, terrain: Terrain) -> list[NDArray[np.float32]]:
+def outlines(image: RangeImage, terrain: Terrain) -> list[Singles]:
     """Closed lines (N, 3) around the ground, metres, in the frame of the image."""
     ground = (terrain.classes == GROUND).astype(np.uint8)
     rings, _ = cv2.findContours(ground, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)

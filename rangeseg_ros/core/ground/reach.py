@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Mask
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.estimate import HIGHEST
 from rangeseg_ros.core.runtime.threads import Task
@@ -24,9 +24,7 @@ _BESIDE = 4
 _BASELINES = 6
 
 
-def reach(
-    place: NDArray[np.float64], variance: NDArray[np.float64], config: Config, turned: bool
-) -> NDArray[np.bool_]:
+def reach(place: Floats, variance: Floats, config: Config, turned: bool) -> Mask:
     """Cells (rows, columns) that a chain leads to.
 
     `place` (3, rows, columns) is height and horizontal position, metres, NaN where nothing is
@@ -57,9 +55,7 @@ def reach(
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def _without_steps(
-    axis: int, place: NDArray[np.float64], variance: NDArray[np.float64], step: float, slope: float
-) -> NDArray[np.bool_]:
+def _without_steps(axis: int, place: Floats, variance: Floats, step: float, slope: float) -> Mask:
     """Measured cells (rows, columns) that are beside no step and on no slope along an axis.
 
     A step is between cells side by side, whatever they are, so that the foot of a wall is none of
@@ -107,14 +103,14 @@ def _without_steps(
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def _spread(
-    place: NDArray[np.float64],
-    variance: NDArray[np.float64],
-    even: NDArray[np.bool_],
+    place: Floats,
+    variance: Floats,
+    even: Mask,
     half: float,
     slope: float,
     gap: float,
     radius: float,
-    reached: NDArray[np.bool_],
+    reached: Mask,
 ) -> None:
     """Add to where chains start what they reach, with the nearest row first."""
     rows, columns = variance.shape

@@ -7,8 +7,9 @@ from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from rangeseg_ros.core.arrays import Floats, Mask
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.stairs import RISE
@@ -76,7 +77,7 @@ def roles(planes: Sequence[Plane], config: Config, up: ArrayLike | None = None) 
     return [str(role) for role in found]
 
 
-def unit(direction: ArrayLike) -> NDArray[np.float64]:
+def unit(direction: ArrayLike) -> Floats:
     """`direction` (3,) as a unit vector; RolesError where it points nowhere."""
     vector = np.asarray(direction, np.float64)
     length = np.linalg.norm(vector)
@@ -85,7 +86,7 @@ def unit(direction: ArrayLike) -> NDArray[np.float64]:
     return vector / length
 
 
-def _floor(candidates: list[Plane], up: NDArray[np.float64], config: Config) -> Plane | None:
+def _floor(candidates: list[Plane], up: Floats, config: Config) -> Plane | None:
     """The floor, by where planes meet the vertical through the sensor or how near they reach."""
     if config.sensor_height > 0:
 
@@ -104,22 +105,22 @@ def _floor(candidates: list[Plane], up: NDArray[np.float64], config: Config) -> 
     return min(candidates, key=reach, default=None)
 
 
-def _largest(planes: Sequence[Plane], chosen: NDArray[np.bool_]) -> list[Plane]:
+def _largest(planes: Sequence[Plane], chosen: Mask) -> list[Plane]:
     """The largest plane of each surface that has a chosen one."""
     by_area = sorted(compress(planes, chosen), key=lambda plane: plane.area)
     return list({plane.surface: plane for plane in by_area}.values())
 
 
-def _offsets(planes: Sequence[Plane], level: Plane) -> NDArray[np.float64]:
+def _offsets(planes: Sequence[Plane], level: Plane) -> Floats:
     """(N,) distance of the planes' centroids from a plane, metres, positive towards the sensor."""
     return np.array([plane.centroid for plane in planes]) @ level.normal + level.distance
 
 
-def corners_of(plane: Plane) -> NDArray[np.float64]:
+def corners_of(plane: Plane) -> Floats:
     """(4, 3) corners of the rectangle around a plane."""
     axes = plane.shape.frame[:, :2]
     half = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) * plane.extents / 2
-    corners: NDArray[np.float64] = plane.centre + half @ axes.T
+    corners: Floats = plane.centre + half @ axes.T
     return corners
 
 
@@ -132,15 +133,15 @@ class Ramp(NamedTuple):
 
     plane: int
     slope: float
-    centre: NDArray[np.float64]
-    climb: NDArray[np.float64]
+    centre: Floats
+    climb: Floats
 
     def __str__(self) -> str:
         """Its slope."""
         return f'ramp {self.slope:.0f} degrees'
 
 
-def ramps_of(planes: Sequence[Plane], up: NDArray[np.float64]) -> list[Ramp]:
+def ramps_of(planes: Sequence[Plane], up: Floats) -> list[Ramp]:
     """The ramps among planes with roles; `up` (3,) is a unit vector in their frame."""
     found = []
     for plane in planes:
@@ -157,7 +158,7 @@ class Tilt(NamedTuple):
     """A camera that stands otherwise than is said, by the up (3,) of the planes."""
 
     degrees: float
-    up: NDArray[np.float64]
+    up: Floats
 
     def __str__(self) -> str:
         """What to do about it, in one line."""
@@ -169,7 +170,7 @@ class Tilt(NamedTuple):
 
 
 def tilt_of(
-    planes: Sequence[Plane], up: NDArray[np.float64], tolerance: float, area: float, slope: float
+    planes: Sequence[Plane], up: Floats, tolerance: float, area: float, slope: float
 ) -> Tilt | None:
     """The tilt that the planes show; None where they agree with `up`, or do not tell.
 
@@ -198,10 +199,8 @@ def tilt_of(
     return Tilt(float(steep[floor]), normals[floor].astype(np.float64))
 
 
-def _agree(
-    normals: NDArray[np.float64], up: NDArray[np.float64], tolerance: float
-) -> NDArray[np.bool_]:
+def _agree(normals: Floats, up: Floats, tolerance: float) -> Mask:
     """Which planes are level or vertical by a direction, within `tolerance` degrees."""
     rise = np.degrees(np.arcsin(np.clip(np.abs(normals @ up), 0, 1)))
-    result: NDArray[np.bool_] = (rise <= tolerance) | (rise >= 90 - tolerance)
+    result: Mask = (rise <= tolerance) | (rise >= 90 - tolerance)
     return result

@@ -14,6 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Singles
 from rangeseg_ros.core.ground.cells import GROUND, axes_of
 from rangeseg_ros.core.ground.terrain import CellTerrain, Terrain
 from rangeseg_ros.core.significance import OUTLIER, SAMPLES
@@ -50,7 +51,7 @@ class Stairs:
     direction : {'up', 'down'}
     """
 
-    edge: NDArray[np.float64]
+    edge: Floats
     width: float
     count: int
     rise: float
@@ -79,7 +80,7 @@ def stairs_of(terrain: Terrain) -> list[Stairs]:
     return found
 
 
-def _find_level(cells: CellTerrain, sign: int, highest: float) -> NDArray[np.float32]:
+def _find_level(cells: CellTerrain, sign: int, highest: float) -> Singles:
     """Heights of level cells off the ground, times `sign`; 0 for all others."""
     rows = np.arange(len(cells.height))[:, None]
     columns = np.arange(cells.height.shape[1])[None]
@@ -122,8 +123,8 @@ def _find_rise(sums: NDArray[np.int64]) -> tuple[float, int]:
 
 
 def _find_noses(
-    place: NDArray[np.float32], tread: NDArray[np.int64], up: bool, count: int
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    place: Singles, tread: NDArray[np.int64], up: bool, count: int
+) -> tuple[NDArray[np.int64], Floats]:
     """Numbers (N,) of treads and places (N, 2) of their noses, in each column from near to far.
 
     Where a tread comes into view behind its riser, and where one ends going down.
@@ -143,12 +144,7 @@ def _find_noses(
 
 
 def _staircase(
-    cells: CellTerrain,
-    level: NDArray[np.float32],
-    sign: int,
-    rise: float,
-    count: int,
-    terrain: Terrain,
+    cells: CellTerrain, level: Singles, sign: int, rise: float, count: int, terrain: Terrain
 ) -> Stairs | None:
     """The staircase with so many treads of that rise; None where the noses do not fit."""
     tread = np.rint(level / rise).astype(np.int64)
@@ -183,9 +179,7 @@ def _staircase(
     )  # fmt: skip
 
 
-def _fit_noses(
-    number: NDArray[np.int64], place: NDArray[np.float64]
-) -> tuple[float, NDArray[np.float64], float] | None:
+def _fit_noses(number: NDArray[np.int64], place: Floats) -> tuple[float, Floats, float] | None:
     """Where tread 0 has its nose, direction and run; None where half of the noses do not fit."""
     design = np.column_stack([np.ones(len(place)), place])
     fits = np.ones(len(design), np.bool_)
@@ -199,11 +193,11 @@ def _fit_noses(
     return -float(solved[0]) / slope, solved[1:] / slope, 1 / slope
 
 
-def _on_ground(ends: NDArray[np.float64], terrain: Terrain) -> NDArray[np.float64]:
+def _on_ground(ends: Floats, terrain: Terrain) -> Floats:
     """Points (2, 3) of the ground under the robot at horizontal places."""
     axes = axes_of(terrain.field.up)
     theta = np.array(terrain.stand.theta)
     flat = ends @ axes[1:]
     depth = (1 - flat @ theta) / (axes[0] @ theta)
-    result: NDArray[np.float64] = flat + depth[:, None] * axes[0]
+    result: Floats = flat + depth[:, None] * axes[0]
     return result

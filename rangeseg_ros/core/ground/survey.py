@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.estimate import STEPS
 from rangeseg_ros.core.ground.grid import GroundGrid, GroundMemory
@@ -31,11 +29,11 @@ class Survey:
     image: RangeImage
     sensor: SensorModel
     config: Config
-    up: NDArray[np.float64]
+    up: Floats
     sensor_height: float
     memory: GroundMemory
     stamp: int = 0
-    pose: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+    pose: tuple[Floats, Floats] | None = None
     fixed_frame: str = ''
     cells: Cells | None = None
 

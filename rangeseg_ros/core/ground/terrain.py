@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Mask, Singles
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.cells import (
     DROP,
@@ -48,11 +49,11 @@ class CellTerrain(NamedTuple):
     where the ray crosses the ground continued, on the axes of `place`; NaN where it does not.
     """
 
-    place: NDArray[np.float32]
-    height: NDArray[np.float32]
+    place: Singles
+    height: Singles
     kind: NDArray[np.int8]
-    error: NDArray[np.float32]
-    crossing: NDArray[np.float32]
+    error: Singles
+    crossing: Singles
 
 
 class Terrain(NamedTuple):
@@ -73,7 +74,7 @@ class Terrain(NamedTuple):
     """
 
     classes: NDArray[np.uint8]
-    height: NDArray[np.float32]
+    height: Singles
     stand: Stand
     field: GroundField
     cells: CellTerrain | None = None
@@ -90,11 +91,7 @@ class Terrain(NamedTuple):
 
 
 def terrain_of(
-    image: RangeImage,
-    sensor: SensorModel,
-    up: NDArray[np.float64],
-    known: tuple[float, float],
-    config: Config,
+    image: RangeImage, sensor: SensorModel, up: Floats, known: tuple[float, float], config: Config
 ) -> Terrain:
     """Class and height of every pixel.
 
@@ -119,7 +116,7 @@ def terrain_of(
 def _upright(
     image: RangeImage,
     sensor: SensorModel,
-    up: NDArray[np.float64],
+    up: Floats,
     known: tuple[float, float],
     config: Config,
     turned: bool,
@@ -153,7 +150,7 @@ def _upright(
     return _with_ground(image, cells, reached, stand, config, turned)
 
 
-def _nearest(above: NDArray[np.float64]) -> float:
+def _nearest(above: Floats) -> float:
     """How far below the sensor the nearest cells are, metres, where no height is stated."""
     nearest = above[np.isfinite(above).argmax(axis=0), np.arange(above.shape[1])]
     return max(-float(np.nanmedian(nearest)), 0.02) if np.isfinite(nearest).any() else 1.0
@@ -171,12 +168,7 @@ def _contradiction(height: float, seen: Continuation | None) -> str:
 
 
 def _with_ground(
-    image: RangeImage,
-    cells: Cells,
-    reached: NDArray[np.bool_],
-    stand: Stand,
-    config: Config,
-    turned: bool,
+    image: RangeImage, cells: Cells, reached: Mask, stand: Stand, config: Config, turned: bool
 ) -> Terrain:
     """Classes and heights by the ground that was reached, continued."""
     field = ground_field(cells, reached, stand.theta)
@@ -237,7 +229,7 @@ def _without_ground(
     return Terrain(classes, np.full(image.shape, np.nan, np.float32), stand, nowhere)
 
 
-def _faces(cells: Cells, config: Config) -> NDArray[np.bool_]:
+def _faces(cells: Cells, config: Config) -> Mask:
     """Cells (rows, columns) of surfaces that rise more steeply than any ground."""
     steep = np.zeros(cells.inverse.shape, np.bool_)
     if len(steep) < 3:

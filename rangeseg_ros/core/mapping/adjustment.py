@@ -22,12 +22,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import block_diag
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
+from rangeseg_ros.core.arrays import Floats, Indices
 from rangeseg_ros.core.mapping.map_planes import MapPlane, moved_onto
 from rangeseg_ros.core.mapping.observations import (
     LASTING,
@@ -63,13 +63,13 @@ class Solution(NamedTuple):
     """
 
     planes: list[MapPlane]
-    covariance: NDArray[np.float64]
+    covariance: Floats
     poses: list[Transform]
-    drift: NDArray[np.float64]
-    drift_covariance: NDArray[np.float64]
+    drift: Floats
+    drift_covariance: Floats
     way: float
     drifts: bool
-    field: NDArray[np.float64]
+    field: Floats
 
     def corrected(self, image: RangeImage, stated: float) -> RangeImage:
         """An image of a camera, of the same cells, without the field; any other one as it is.
@@ -105,7 +105,7 @@ class Adjustment:
         self._poses: list[Transform] = []
         self._planes: list[PlaneSet] = []
         # Of their covariances, and in their units what the distortion makes of them.
-        self._root: list[NDArray[np.float64]] = []
+        self._root: list[Floats] = []
         self._effects: list[sparse.csr_array] = []
         # Number of its frame, id of its plane and number of its run, for each observation.
         self._index: list[tuple[int, int, int]] = []
@@ -183,7 +183,7 @@ class Adjustment:
 
     def _solved(
         self, told: _State, sightings: _Sightings, drifts: bool
-    ) -> tuple[_State, NDArray[np.float64], NDArray[np.float64]]:
+    ) -> tuple[_State, Floats, Floats]:
         """The most probable state and all else, and the covariance of all planes and the drift."""
         # What lasts, what jumps were taken for wrongly, and the drift.
         state, rest = told, np.zeros(sightings.lasting.shape[1] + 6 * len(self._jumps) + 3)
@@ -206,7 +206,7 @@ class Adjustment:
         parts = [factors.solve(unit[:, block].toarray())[chosen] for block in blocks]
         return state, rest, np.hstack(parts)
 
-    def _way(self) -> NDArray[np.float64]:
+    def _way(self) -> Floats:
         """(F,) way of the camera up to each frame; less than the noise of poses is no way."""
         way, total, place = [], 0.0, self._poses[0].shift
         for pose in self._poses:
@@ -216,7 +216,7 @@ class Adjustment:
             way.append(total)
         return np.array(way)
 
-    def _prior(self, planes: int, precision: NDArray[np.float64], drifts: bool) -> Any:
+    def _prior(self, planes: int, precision: Floats, drifts: bool) -> Any:
         """What is known beforehand of all but the planes, as equations of unit variance."""
         frames, way = len(self._poses), self._way()
         change = sparse.eye(frames)
@@ -244,7 +244,7 @@ class Adjustment:
         return sparse.hstack([sparse.csr_array((rows.shape[0], planes)), rows]).tocsr()
 
 
-def _blocks(values: NDArray[np.float64], column: NDArray[np.intp], count: int) -> sparse.csr_array:
+def _blocks(values: Floats, column: Indices, count: int) -> sparse.csr_array:
     """Matrices (N, 3, K) one below the other, each at one of `count` columns of matrices."""
     size = values.shape[2]
     columns = np.repeat(size * column[:, None] + np.arange(size), 3, axis=0).ravel()
@@ -259,27 +259,27 @@ class _Sightings(NamedTuple):
     the field, in what is new of the errors, `precision` (L,) its inverse variance beforehand.
     """
 
-    frame: NDArray[np.intp]
-    plane: NDArray[np.intp]
+    frame: Indices
+    plane: Indices
     seen: PlaneSet
-    root: NDArray[np.float64]
+    root: Floats
     lasting: sparse.csr_array
-    precision: NDArray[np.float64]
+    precision: Floats
 
 
 class _State(NamedTuple):
     """Planes and poses as they are estimated."""
 
     planes: PlaneSet
-    turn: NDArray[np.float64]
-    shift: NDArray[np.float64]
+    turn: Floats
+    shift: Floats
 
-    def pose_errors(self, told: _State) -> NDArray[np.float64]:
+    def pose_errors(self, told: _State) -> Floats:
         """(6 F,) what poses that were told err by."""
         turn = Rotation.from_matrix(told.turn @ self.turn.transpose(0, 2, 1)).as_rotvec()
         return np.column_stack([turn, told.shift - self.shift]).ravel()
 
-    def corrected(self, planes: NDArray[np.float64], poses: NDArray[np.float64]) -> _State:
+    def corrected(self, planes: Floats, poses: Floats) -> _State:
         """Without these errors, (3 P,) and (6 F,)."""
         turn, shift = np.split(poses.reshape(-1, 6), 2, axis=1)
         back = Rotation.from_rotvec(-turn).as_matrix()
@@ -287,9 +287,7 @@ class _State(NamedTuple):
             self.planes.without(planes.reshape(-1, 3)), back @ self.turn, self.shift - shift
         )
 
-    def equations(
-        self, sightings: _Sightings, rest: NDArray[np.float64]
-    ) -> tuple[sparse.csr_array, NDArray[np.float64]]:
+    def equations(self, sightings: _Sightings, rest: Floats) -> tuple[sparse.csr_array, Floats]:
         """Derivatives (3 N, D) of observations by all unknowns, and the gaps (3 N,), whitened.
 
         Of the `rest`, the first are what lasts of the errors; the others are of the poses only.

@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.enlargement import Cells
 from rangeseg_ros.core.sensing.grid import GridEdges
@@ -32,7 +32,7 @@ class JumpPoints(NamedTuple):
     `width` is that of the squares that they are known to, radians.
     """
 
-    points: NDArray[np.float64]
+    points: Floats
     width: float
 
     @classmethod
@@ -51,8 +51,8 @@ class JumpPoints(NamedTuple):
         return cls(points, image.pixel_area**0.5)
 
     def motion(
-        self, last: JumpPoints, before: Transform, pose: Transform, prior: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        self, last: JumpPoints, before: Transform, pose: Transform, prior: Floats
+    ) -> tuple[Floats, Floats]:
         """What these points tell of the errors of the poses `pose` and `before`, of the `last`.
 
         The errors are turns in the camera's axes and shifts, (12,), `prior` (12, 12) is their
@@ -99,7 +99,7 @@ class JumpPoints(NamedTuple):
             limit = CAUCHY * deviation
         return design, values
 
-    def _across(self, neighbours: NDArray[np.intp]) -> NDArray[np.float64]:
+    def _across(self, neighbours: Indices) -> Floats:
         """Directions (N, 3) across the edges and rays, over the range, by `neighbours` (N, K)."""
         near = self.points[neighbours]
         near -= near.mean(axis=1, keepdims=True)

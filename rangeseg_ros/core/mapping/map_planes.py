@@ -9,8 +9,8 @@ from typing import TypeVar
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.description.shapes import Shape
 from rangeseg_ros.core.mapping.observations import PlaneSet
@@ -30,24 +30,24 @@ class MapOutline:
     borders of its holes, clockwise.
     """
 
-    parts: list[list[NDArray[np.float64]]]
+    parts: list[list[Floats]]
 
     @property
-    def hull(self) -> NDArray[np.float64]:
+    def hull(self) -> Floats:
         """(N, 3) border of the largest part, metres."""
         return self.parts[0][0] if self.parts else np.zeros((0, 3))
 
     @property
-    def holes(self) -> list[NDArray[np.float64]]:
+    def holes(self) -> list[Floats]:
         """Borders (N, 3) of the holes in the largest part."""
         return self.parts[0][1:] if self.parts else []
 
     @property
-    def rings(self) -> list[NDArray[np.float64]]:
+    def rings(self) -> list[Floats]:
         """All borders (N, 3)."""
         return [ring for part in self.parts for ring in part]
 
-    def moved(self, motion: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> MapOutline:
+    def moved(self, motion: Callable[[Floats], Floats]) -> MapOutline:
         """The outline with its corners (N, 3) moved."""
         return MapOutline([[motion(ring) for ring in part] for part in self.parts])
 
@@ -114,7 +114,7 @@ class Record:
             setattr(self, name, getattr(self, name) + getattr(other, name))
 
 
-def describe(record: Record, plane: PlaneSet, covariance: NDArray[np.float64]) -> MapPlane:
+def describe(record: Record, plane: PlaneSet, covariance: Floats) -> MapPlane:
     """The plane of a record: one of the fixed frame, with the axes of its grid.
 
     `covariance` (4, 4) is that of normal and distance.
@@ -181,7 +181,7 @@ def moved_planes(planes: Sequence[AnyPlane], motion: Transform) -> list[AnyPlane
 
 
 def moved_onto(
-    planes: Sequence[MapPlane], equations: NDArray[np.float64], covariance: NDArray[np.float64]
+    planes: Sequence[MapPlane], equations: Floats, covariance: Floats
 ) -> list[MapPlane]:
     """Planes turned about their centroids onto other equations (P, 4).
 

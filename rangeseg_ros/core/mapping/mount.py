@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.odometry import level
 from rangeseg_ros.core.rotations import quaternions
@@ -29,19 +29,19 @@ class Mount(NamedTuple):
     roll: float
     pitch: float
     height: float
-    sigma: NDArray[np.float64]
-    rotation: NDArray[np.float64]
+    sigma: Floats
+    rotation: Floats
     doubts: list[str]
 
     @property
-    def quaternion(self) -> NDArray[np.float64]:
+    def quaternion(self) -> Floats:
         """x, y, z, w of `rotation`."""
         return quaternions(self.rotation)
 
     @property
-    def rpy(self) -> NDArray[np.float64]:
+    def rpy(self) -> Floats:
         """Angles about the fixed axes x, y, z, as URDF has them, radians."""
-        angles: NDArray[np.float64] = Rotation.from_matrix(self.rotation).as_euler('xyz')
+        angles: Floats = Rotation.from_matrix(self.rotation).as_euler('xyz')
         return angles
 
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices, Labels
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.distortion import in_pixels
@@ -44,9 +45,9 @@ class PlaneSet(NamedTuple):
     The tangents `axes` turn with their plane: a motion leaves its error x = (a, b, c) as it is.
     """
 
-    normal: NDArray[np.float64]
-    point: NDArray[np.float64]
-    axes: NDArray[np.float64]
+    normal: Floats
+    point: Floats
+    axes: Floats
 
     @classmethod
     def of(cls, planes: Sequence[Plane]) -> PlaneSet:
@@ -57,12 +58,12 @@ class PlaneSet(NamedTuple):
         return cls(normal, centroid - offset[:, None] * normal, tangents(normal))
 
     @property
-    def distance(self) -> NDArray[np.float64]:
+    def distance(self) -> Floats:
         """(N,) of normal . p + distance = 0, metres."""
         return -(self.normal * self.point).sum(axis=1)
 
     @property
-    def equations(self) -> NDArray[np.float64]:
+    def equations(self) -> Floats:
         """(N, 4) normals and distances."""
         return np.column_stack([self.normal, self.distance])
 
@@ -80,17 +81,15 @@ class PlaneSet(NamedTuple):
         normal, point = ((turn @ part[..., None])[..., 0] for part in self[:2])
         return PlaneSet(normal, point + shift, self.axes @ np.swapaxes(turn, -1, -2))
 
-    def without(self, errors: NDArray[np.float64]) -> PlaneSet:
+    def without(self, errors: Floats) -> PlaneSet:
         """The planes without these errors (N, 3)."""
         return PlaneSet(*shifted(*self, errors))
 
-    def by_motion(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
+    def by_motion(self, place: Floats) -> Floats:
         """(N, 3, 6) what a turn about `place` (3,) or (N, 3) and a shift of planes change."""
         return by_motion(self.normal, self.axes, self.point - place)
 
-    def by_field(
-        self, view: NDArray[np.float64], rays: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def by_field(self, view: Floats, rays: Floats) -> Floats:
         """(N, 3, C) what planes err by with errors of the inverse range in C cells of the image.
 
         `view` (N, C) is of `views`, `rays` (C, 3) of `cell_rays`; planes are where the camera sees
@@ -105,21 +104,21 @@ class PlaneSet(NamedTuple):
         )
         return np.asarray(to_errors(self.axes, self.point) @ equations)
 
-    def apart(self, others: PlaneSet) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def apart(self, others: PlaneSet) -> tuple[Floats, Floats]:
         """What others differ by, (N, 3), as errors of these, and (N, 3, 3) that by their own."""
         local = to_errors(self.axes, self.point)
         gap = (local @ others.equations[..., None])[..., 0]
         return gap, local @ from_errors(others.axes, others.point)
 
-    def covariances(self, errors: NDArray[np.float64]) -> NDArray[np.float64]:
+    def covariances(self, errors: Floats) -> Floats:
         """(N, 4, 4) of normals and distances, of rank 3, for those of errors (N, 3, 3)."""
         return congruent(from_errors(self.axes, self.point), errors)
 
-    def coordinates(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def coordinates(self, points: Floats) -> Floats:
         """(N, 2) of a point (N, 3) on each plane, along its axes from its own point."""
         return np.asarray((self.axes * (points - self.point)[:, None]).sum(axis=2))
 
-    def points(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
+    def points(self, at: Floats) -> Floats:
         """Points (N, 3) at coordinates (N, 2) on each plane."""
         return self.point + at[:, :1] * self.axes[:, 0] + at[:, 1:] * self.axes[:, 1]
 
@@ -131,7 +130,7 @@ class PoseNoise(NamedTuple):
     turn: float
 
     @property
-    def deviations(self) -> NDArray[np.float64]:
+    def deviations(self) -> Floats:
         """(6,) of the turn about three axes and of the shift."""
         return np.repeat([self.turn, self.shift], 3)
 
@@ -145,12 +144,12 @@ class Observations(NamedTuple):
     """
 
     planes: PlaneSet
-    covariance: NDArray[np.float64]
-    by_pose: NDArray[np.float64]
-    view: NDArray[np.float64]
+    covariance: Floats
+    by_pose: Floats
+    view: Floats
 
     @property
-    def spread(self) -> NDArray[np.float64]:
+    def spread(self) -> Floats:
         """(M, 3, 3) covariance of all of their errors."""
         return self.covariance + congruent(self.by_pose, np.eye(6))
 
@@ -160,7 +159,7 @@ class Observations(NamedTuple):
 
 
 def observations(
-    planes: Sequence[Plane], view: NDArray[np.float64], pose: Transform, noise: PoseNoise
+    planes: Sequence[Plane], view: Floats, pose: Transform, noise: PoseNoise
 ) -> Observations:
     """Planes of a frame, with their errors and those of the camera's pose, in the fixed frame."""
     seen = PlaneSet.of(planes)
@@ -176,7 +175,7 @@ def observations(
     return Observations(seen, covariance, by_pose, view)
 
 
-def continuity(before: NDArray[np.float64], now: NDArray[np.float64]) -> NDArray[np.float64]:
+def continuity(before: Floats, now: Floats) -> Floats:
     """Correlation (K,) of the errors that last of planes with views (K, C) before and now.
 
     Where most of the pixels are the same it is 1: small motions to and fro are no new looks.
@@ -185,9 +184,7 @@ def continuity(before: NDArray[np.float64], now: NDArray[np.float64]) -> NDArray
     return np.where(alike >= 0.5, 1.0, alike)
 
 
-def views(
-    labels: NDArray[np.uint16], planes: Sequence[Plane], stated: float
-) -> NDArray[np.float64]:
+def views(labels: Labels, planes: Sequence[Plane], stated: float) -> Floats:
     """Where in the image planes are: pixels in each of its square cells, as unit vectors (M, C).
 
     Cells are twice as large as the pixels over which the errors of the sensor hang together, as
@@ -205,7 +202,7 @@ def views(
     return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1))
 
 
-def _cells(shape: tuple[int, int], stated: float) -> tuple[int, NDArray[np.intp]]:
+def _cells(shape: tuple[int, int], stated: float) -> tuple[int, Indices]:
     """Step of the pixels that are looked at, and their cells (H / step, W / step)."""
     length = length_of_distortion(stated, shape)
     step = max(int(2 * length // _SAMPLES), 1)
@@ -214,7 +211,7 @@ def _cells(shape: tuple[int, int], stated: float) -> tuple[int, NDArray[np.intp]
     return step, rows[:, None] * (columns[-1] + 1) + columns
 
 
-def cell_rays(image: RangeImage, stated: float) -> NDArray[np.float64]:
+def cell_rays(image: RangeImage, stated: float) -> Floats:
     """(C, 3) mean rays of the cells of `views`."""
     step, cell = _cells(image.shape, stated)
     rays = image.rays[::step, ::step].reshape(-1, 3)
@@ -222,7 +219,7 @@ def cell_rays(image: RangeImage, stated: float) -> NDArray[np.float64]:
     return np.stack(sums, axis=1) / np.bincount(cell.ravel())[:, None]
 
 
-def field_in_pixels(field: NDArray[np.float64], shape: tuple[int, int], stated: float) -> NDArray:
+def field_in_pixels(field: Floats, shape: tuple[int, int], stated: float) -> NDArray:
     """A field over cells (C,) in the pixels of an image (H, W); `stated` as for `views`."""
     step, cell = _cells(shape, stated)
     side = step * int(np.count_nonzero(cell[0] == 0))

@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag
 
+from rangeseg_ros.core.arrays import Floats, Mask
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.mapping.edges import JumpPoints
@@ -69,12 +70,12 @@ class Motion(NamedTuple):
 
     frame: str
     pose: Transform
-    covariance: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    velocity_covariance: NDArray[np.float64]
+    covariance: Floats
+    velocity: Floats
+    velocity_covariance: Floats
     held: int
 
-    def of_origin(self, place: NDArray[np.float64]) -> Motion:
+    def of_origin(self, place: Floats) -> Motion:
         """The motion of a camera at `place` (3,), as that of the origin of its frame."""
         turn, shift = self.pose
         # What turns the camera by w moves the origin by w x -place against it.
@@ -111,14 +112,14 @@ class PlaneOdometry:
         self._covariance = np.diag(np.concatenate([np.zeros(6), self._spread**2, np.zeros(6)]))
 
     @property
-    def _spread(self) -> NDArray[np.float64]:
+    def _spread(self) -> Floats:
         """(6,) standard deviations of the velocity: radians, then metres per second."""
         return np.repeat([np.radians(self.config.camera_turn), self.config.camera_speed], 3)
 
     def add(
         self,
         planes: Sequence[Plane],
-        view: NDArray[np.float64],
+        view: Floats,
         stamp: int,
         up: ArrayLike,
         axes: ArrayLike = ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
@@ -229,12 +230,7 @@ class PlaneOdometry:
         return self._corrected(pose, gain @ values, gain, design, noise)
 
     def _corrected(
-        self,
-        pose: Transform,
-        step: NDArray[np.float64],
-        gain: NDArray[np.float64],
-        design: NDArray[np.float64],
-        noise: NDArray[np.float64],
+        self, pose: Transform, step: Floats, gain: Floats, design: Floats, noise: Floats
     ) -> Transform:
         """The pose without the errors `step` that measurements show; in place the rest."""
         left = np.eye(len(gain)) - gain @ design
@@ -259,7 +255,7 @@ class PlaneOdometry:
         fresh = block_diag(*((1 - LASTING) * seen.covariance))
         self._covariance[before:, before:] += fresh
 
-    def _keep(self, chosen: NDArray[np.bool_]) -> None:
+    def _keep(self, chosen: Mask) -> None:
         """Forget the other planes."""
         states = np.concatenate([np.ones(_CAMERA, bool), np.repeat(chosen, 3)])
         self._covariance = self._covariance[np.ix_(states, states)]
@@ -267,7 +263,7 @@ class PlaneOdometry:
         self._id, self._view = self._id[chosen], self._view[chosen]
 
 
-def _by_camera(planes: PlaneSet, pose: Transform) -> NDArray[np.float64]:
+def _by_camera(planes: PlaneSet, pose: Transform) -> Floats:
     """(N, 3, 18) derivatives of planes (N,) that a camera sees by its pose; 0 by the rest."""
     design = np.zeros((len(planes.normal), 3, _CAMERA))
     design[:, :, :6] = planes.by_motion(np.zeros(3))
@@ -276,7 +272,7 @@ def _by_camera(planes: PlaneSet, pose: Transform) -> NDArray[np.float64]:
     return design
 
 
-def level(up: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
+def level(up: Floats, axes: Floats) -> Floats:
     """Rotation from a camera that sees `up` to x forward and z up."""
     up = up / np.linalg.norm(up)
     # Straight up or down, forward is where the top of the image is.

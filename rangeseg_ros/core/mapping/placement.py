@@ -9,8 +9,8 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.transforms import Transform, TransformError
 from rangeseg_ros.core.significance import CLEARLY, chi2_quantile
@@ -33,7 +33,7 @@ class Up(NamedTuple):
     `sd` is its standard deviation about either axis across it, degrees.
     """
 
-    direction: NDArray[np.float64]
+    direction: Floats
     sd: float
     source: str
 
@@ -56,7 +56,7 @@ class Placement:
     target: Transform | None = None
     ups: list[Up] = field(default_factory=list)
     asked: bool = False
-    up: NDArray[np.float64] | None = None
+    up: Floats | None = None
     up_sd: float | None = None
     lost: str = ''
     height: float | None = None
@@ -66,10 +66,7 @@ class Placement:
 
 
 def find_placement(
-    config: Config,
-    frame: str,
-    lookup: Lookup,
-    acceleration: tuple[str, NDArray[np.float64]] | None = None,
+    config: Config, frame: str, lookup: Lookup, acceleration: tuple[str, Floats] | None = None
 ) -> Placement:
     """Look up what the parameters ask for at an image in `frame`.
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices, Mask
 from rangeseg_ros.core.mapping.observations import (
     LASTING,
     Observations,
@@ -45,9 +46,9 @@ class PlaneFilters(NamedTuple):
     """
 
     planes: PlaneSet
-    covariance: NDArray[np.float64]
-    view: NDArray[np.float64]
-    looks: NDArray[np.intp]
+    covariance: Floats
+    view: Floats
+    looks: Indices
 
     @classmethod
     def of(cls, seen: Observations) -> PlaneFilters:
@@ -61,9 +62,7 @@ class PlaneFilters(NamedTuple):
         parts: list[Any] = [part[chosen] for part in self[1:]]
         return PlaneFilters(self.planes.where(chosen), *parts)
 
-    def moved(
-        self, motion: Transform, place: NDArray[np.float64], error: NDArray[np.float64]
-    ) -> PlaneFilters:
+    def moved(self, motion: Transform, place: Floats, error: Floats) -> PlaneFilters:
         """The planes in another frame; the motion errs by a turn about `place` and a shift.
 
         `error` (6, 6) is the covariance of these.
@@ -79,8 +78,8 @@ class PlaneFilters(NamedTuple):
         return PlaneFilters(self.planes.joined(others.planes), *parts)
 
     def alike(
-        self, others: PlaneSet, covariance: NDArray[np.float64], camera: NDArray[np.float64]
-    ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
+        self, others: PlaneSet, covariance: Floats, camera: Floats
+    ) -> tuple[Indices, Indices, Floats]:
         """Which of these planes and of M others may be one by what is known of both.
 
         Numbers (K,) of these and (K,) of the others, and chi-squared (K,) of three degrees of
@@ -100,7 +99,7 @@ class PlaneFilters(NamedTuple):
         fits = value < GATE
         return k[fits], m[fits], value[fits]
 
-    def update(self, index: NDArray[np.intp], seen: Observations) -> NDArray[np.bool_]:
+    def update(self, index: Indices, seen: Observations) -> Mask:
         """Take in what is seen of the planes `index` (K,), each at most once; which runs begin."""
         planes = self.planes.where(index)
         gap, turned = planes.apart(seen.planes)
@@ -129,19 +128,17 @@ class PlaneFilters(NamedTuple):
         self._correct(np.array([k]), np.linalg.inv(own + other)[None], other @ gap[..., None])
         self.view[k] = 0
 
-    def _correct(
-        self, index: NDArray[np.intp], covariance: NDArray[np.float64], told: NDArray[np.float64]
-    ) -> None:
+    def _correct(self, index: Indices, covariance: Floats, told: Floats) -> None:
         """Take the errors that covariance @ told (K, 3, 1) is off the planes `index` (K,)."""
         moved = self.planes.where(index).without((covariance @ told)[..., 0])
         for whole, part in zip(self.planes, moved, strict=True):
             whole[index] = part
         self.covariance[index] = covariance
 
-    def variances(self, index: NDArray[np.intp], at: NDArray[np.float64]) -> NDArray[np.float64]:
+    def variances(self, index: Indices, at: Floats) -> Floats:
         """Variances (K,), across the planes `index` (K,), at coordinates (K, 2)."""
         lever = np.column_stack([at, np.ones(len(at))])
-        variance: NDArray[np.float64]
+        variance: Floats
         variance = np.einsum('ki,kij,kj->k', lever, self.covariance[index], lever)
         return variance
 
@@ -155,9 +152,9 @@ class Jump(NamedTuple):
     """
 
     motion: Transform
-    camera: NDArray[np.float64]
-    error: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    camera: Floats
+    error: Floats
+    covariance: Floats
 
     def __str__(self) -> str:
         turn, shift = np.linalg.norm(self.error.reshape(2, 3), axis=1)
@@ -168,7 +165,7 @@ class Jump(NamedTuple):
 
 
 def find_jump(
-    known: PlaneFilters, seen: Observations, camera: NDArray[np.float64], noise: PoseNoise
+    known: PlaneFilters, seen: Observations, camera: Floats, noise: PoseNoise
 ) -> Jump | None:
     """Test the pose of a frame by K planes of the map that it shows, in the same order.
 

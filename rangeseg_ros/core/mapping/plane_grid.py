@@ -13,8 +13,8 @@ from copy import copy
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices, Labels, Mask, Singles
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.mapping.observations import PlaneSet
 from rangeseg_ros.core.sensing.camera import Camera
@@ -35,7 +35,7 @@ _BITS = 8
 # Least cosine of incidence: 3 degrees, where rays run along what they could pass through.
 _GRAZING = 0.05
 
-Polygon = Sequence[NDArray[np.float64]]
+Polygon = Sequence[Floats]
 """Border (N, 2) and borders of holes, metres along the axes of a plane."""
 
 
@@ -68,12 +68,12 @@ class PlaneGrid:
     def sure_area(self) -> float:
         return self._sure * self.side**2
 
-    def centres(self, chosen: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+    def centres(self, chosen: Mask | None = None) -> Floats:
         """Centres (K, 2) of the cells where the plane is, or of those chosen (V, U)."""
         v, u = np.nonzero(self.odds > 0 if chosen is None else chosen)
         return np.asarray((np.stack([u, v], axis=1) + self.first + 0.5) * self.side, np.float64)
 
-    def distance(self, point: NDArray[np.float64], limit: float) -> float:
+    def distance(self, point: Floats, limit: float) -> float:
         """From a point (2,) to the next cell where the plane is, metres; 0 inside.
 
         Beyond the limit it may be infinity.
@@ -86,12 +86,12 @@ class PlaneGrid:
             return np.inf
         return float(np.hypot(*(self.centres() - point).T).min(initial=np.inf))
 
-    def cells(self, points: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def cells(self, points: Floats) -> tuple[Indices, Indices]:
         """Rows (K,) and columns (K,) of the cells that points (K, 2) are in."""
         u, v = (np.floor(points / self.side).astype(np.intp) - self.first).T
         return v, u
 
-    def fill(self, parts: Sequence[Polygon]) -> NDArray[np.bool_]:
+    def fill(self, parts: Sequence[Polygon]) -> Mask:
         """Cells (V, U) all of whose corners are in a polygon; of slivers, one in their middle."""
         if not parts:
             return np.zeros(self.odds.shape, np.bool_)
@@ -106,7 +106,7 @@ class PlaneGrid:
             inside[self.cells(np.mean(parts[0][0], axis=0, keepdims=True))] = True
         return inside
 
-    def add(self, cells: NDArray[np.bool_], change: float) -> None:
+    def add(self, cells: Mask, change: float) -> None:
         """Take in a look, `HIT` or `MISS`, at cells (V, U)."""
         if cells.any():
             there, sure = self._there, self._sure
@@ -116,7 +116,7 @@ class PlaneGrid:
                 self._whole._there += self._there - there
                 self._whole._sure += self._sure - sure
 
-    def part(self, start: NDArray[np.intp], end: NDArray[np.intp]) -> PlaneGrid:
+    def part(self, start: Indices, end: Indices) -> PlaneGrid:
         """The cells from the column and row `start` (2,) to before `end` (2,), shared."""
         part = copy(self)
         part.odds = self.odds[start[1] : end[1], start[0] : end[0]]
@@ -124,7 +124,7 @@ class PlaneGrid:
         part._measure()
         return part
 
-    def absorb(self, centres: NDArray[np.float64], odds: NDArray[np.float32]) -> None:
+    def absorb(self, centres: Floats, odds: Singles) -> None:
         """Take in cells (K, 2) of another grid, with their odds (K,), on this plane."""
         self.reach(centres)
         np.maximum.at(self.odds, self.cells(centres), odds)
@@ -150,7 +150,7 @@ class PlaneGrid:
             if parents[k] < 0
         ]
 
-    def reach(self, points: NDArray[np.float64]) -> None:
+    def reach(self, points: Floats) -> None:
         """Have cells for points (N, 2), one at least."""
         least, most = points.min(axis=0), points.max(axis=0)
         low, high = (np.floor(end / self.side).astype(np.intp) for end in (least, most))
@@ -208,8 +208,8 @@ def in_sight(
 
 
 def seen_cells(
-    grid: PlaneGrid, own: PlaneSet, plane: Plane, labels: NDArray[np.uint16], camera: Camera
-) -> NDArray[np.bool_]:
+    grid: PlaneGrid, own: PlaneSet, plane: Plane, labels: Labels, camera: Camera
+) -> Mask:
     """Cells (V, U) of a plane of the map, one in the frame of the image, where a frame found it.
 
     The plane that the frame found lies over the cells, which pixels of its label look at. Cells
@@ -226,12 +226,12 @@ def seen_cells(
 
 
 def passed_through(
-    points: NDArray[np.float64],
-    offset: NDArray[np.float64],
-    variance: Callable[[NDArray[np.intp]], NDArray[np.float64]],
+    points: Floats,
+    offset: Floats,
+    variance: Callable[[Indices], Floats],
     image: RangeImage,
     sensor: SensorModel,
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Whether rays pass through points (K, 3) of planes; they do not where they end before.
 
     Points are in the frame of the image, which is that of a camera: of a cloud, nobody knows which

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices, Labels, Mask
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.roles import corners_of
@@ -49,8 +50,8 @@ class Sighting(NamedTuple):
     pose: Transform
     seen: Observations
     ids: NDArray[np.int64]
-    begins: NDArray[np.bool_]
-    rays: NDArray[np.float64]
+    begins: Mask
+    rays: Floats
     jump: Jump | None = None
 
 
@@ -119,7 +120,7 @@ class PlaneMap:
 
     def add(
         self,
-        labels: NDArray[np.uint16],
+        labels: Labels,
         planes: Sequence[Plane],
         image: RangeImage,
         pose: Transform,
@@ -163,11 +164,7 @@ class PlaneMap:
         self._forget()
 
     def _followed(
-        self,
-        planes: Sequence[Plane],
-        seen: Observations,
-        camera: NDArray[np.float64],
-        noise: PoseNoise,
+        self, planes: Sequence[Plane], seen: Observations, camera: Floats, noise: PoseNoise
     ) -> Jump | None:
         """Find a jump of the fixed frame by planes that were followed through it; follow it."""
         known = {record.track: k for k, record in enumerate(self._records)}
@@ -193,9 +190,7 @@ class PlaneMap:
         self._filters = self._filters.moved(jump.motion, jump.camera, jump.covariance)
         return jump
 
-    def _associate(
-        self, planes: Sequence[Plane], seen: Observations, camera: NDArray[np.float64]
-    ) -> NDArray[np.intp]:
+    def _associate(self, planes: Sequence[Plane], seen: Observations, camera: Floats) -> Indices:
         """Numbers (M,) of the planes of the map that the planes of a frame are, -1 for none."""
         index, which, value = self._filters.alike(seen.planes, seen.spread, camera)
         at = self._filters.planes.where(index).coordinates(seen.planes.point[which])
@@ -215,9 +210,9 @@ class PlaneMap:
 
     def _find(
         self,
-        labels: NDArray[np.uint16],
+        labels: Labels,
         planes: Sequence[Plane],
-        match: NDArray[np.intp],
+        match: Indices,
         image: RangeImage,
         pose: Transform,
         noise: PoseNoise,
@@ -268,7 +263,7 @@ class PlaneMap:
             cells[cells], passed = np.split(passed, [np.count_nonzero(cells)])
             looked_at[k].add(cells, 2 * MISS)
 
-    def _merge(self, some: NDArray[np.intp], camera: NDArray[np.float64]) -> None:
+    def _merge(self, some: Indices, camera: Floats) -> None:
         """Unite planes of the map that turn out to be one with `some` of this frame."""
         filters = self._filters
         number, others, _ = filters.where(some).alike(filters.planes, filters.covariance, camera)
@@ -293,7 +288,7 @@ class PlaneMap:
             kept[m] = False
         self._keep(kept)
 
-    def _keep(self, chosen: NDArray[np.bool_]) -> None:
+    def _keep(self, chosen: Mask) -> None:
         if not chosen.all():
             self._filters = self._filters.where(chosen)
             self._records = [r for r, kept in zip(self._records, chosen, strict=True) if kept]

@@ -13,8 +13,9 @@ from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.rotations import rotation_by, rotation_matrix
 
 CACHE_TIME = 10 * 10**9
@@ -46,8 +47,8 @@ class Transform(NamedTuple):
         Metres.
     """
 
-    rotation: NDArray[np.float64]
-    shift: NDArray[np.float64]
+    rotation: Floats
+    shift: Floats
 
     @classmethod
     def identity(cls) -> Transform:
@@ -80,11 +81,11 @@ class Transform(NamedTuple):
         """This motion after `first`."""
         return Transform(self.rotation @ first.rotation, self.rotation @ first.shift + self.shift)
 
-    def apply(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def apply(self, points: Floats) -> Floats:
         """Points (N, 3) in the other frame."""
         return points @ self.rotation.T + self.shift
 
-    def by(self, error: NDArray[np.float64]) -> Transform:
+    def by(self, error: Floats) -> Transform:
         """This motion, off by a turn in its own axes, radians, and a shift, metres, (6,)."""
         return Transform(self.rotation @ rotation_by(error[:3]), self.shift + error[3:])
 
@@ -94,8 +95,8 @@ class _Sample(NamedTuple):
 
     stamp: int
     parent: str
-    rotation: NDArray[np.float64]
-    shift: NDArray[np.float64]
+    rotation: Floats
+    shift: Floats
 
 
 _stamp = itemgetter(0)

@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Singles
 from rangeseg_ros.core.config import VGA
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.enlargement import Cells, camera_of_cells
@@ -43,7 +44,7 @@ class Bins(NamedTuple):
     side: int
     pixels: RangeImage
     means: RangeImage
-    spread: NDArray[np.float32]
+    spread: Singles
     area: float
 
     @classmethod
@@ -86,7 +87,7 @@ class Bins(NamedTuple):
         new = quantile((a - b - c + d) ** 2 / expected, 0.5) / (4 * _MEDIAN)
         return float(1 + (1 - 1 / side**2) * new)
 
-    def of_one_surface(self, steps: NDArray[np.float32]) -> RangeImage:
+    def of_one_surface(self, steps: Singles) -> RangeImage:
         """Means of the measurements near each bin's median: a jump mixes no two surfaces.
 
         `steps` are the smallest jumps in blocks of 4 x 4 bins, 1/m.
@@ -101,9 +102,7 @@ class Bins(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _average(
-    pixels: NDArray[np.float32], side: int, means: NDArray[np.float32], spread: NDArray[np.float32]
-) -> None:
+def _average(pixels: Singles, side: int, means: Singles, spread: Singles) -> None:
     """Fill in the mean of what was measured in each bin, and the largest difference there."""
     rows, columns = means.shape
     total, count = np.empty(columns), np.empty(columns, np.float32)
@@ -127,14 +126,14 @@ def _average(
 
 @njit(cache=True, nogil=True)
 def _average_near_median(
-    pixels: NDArray[np.float32],
-    rays: NDArray[np.float32],
+    pixels: Singles,
+    rays: Singles,
     side: int,
-    spread: NDArray[np.float32],
-    steps: NDArray[np.float32],
+    spread: Singles,
+    steps: Singles,
     slope: np.float32,
-    means: NDArray[np.float32],
-    mean_rays: NDArray[np.float32],
+    means: Singles,
+    mean_rays: Singles,
 ) -> None:
     """Average the measurements of bins whose `spread` is wide again, near their median alone."""
     values, total = np.empty(side * side, np.float32), np.empty(4)
@@ -180,9 +179,7 @@ def _places(pixels: NDArray, side: int) -> list[NDArray]:
     return [pixels[i::side, j::side] for i, j in np.ndindex(side, side)]
 
 
-def _means(
-    values: NDArray | Sequence[NDArray], kept: NDArray | Sequence[NDArray]
-) -> NDArray[np.float32]:
+def _means(values: NDArray | Sequence[NDArray], kept: NDArray | Sequence[NDArray]) -> Singles:
     """Means (...) of those of the values (K, ...) that are kept; 0 of none."""
     total = np.zeros(values[0].shape)
     for each, some in zip(values, kept, strict=True):

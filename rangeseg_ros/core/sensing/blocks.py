@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Singles
 from rangeseg_ros.core.sensing.moments import (
     CHI2,
     COUNT,
@@ -37,10 +38,10 @@ class Blocks(NamedTuple):
     what noise adds to it; `residual` is the sum of the squared residuals.
     """
 
-    moments: NDArray[np.float64]
-    squared: NDArray[np.float64]
-    slope: NDArray[np.float64]
-    residual: NDArray[np.float64]
+    moments: Floats
+    squared: Floats
+    slope: Floats
+    residual: Floats
 
     @classmethod
     def of(cls, image: RangeImage, size: int = BLOCK) -> Blocks:
@@ -56,7 +57,7 @@ class Blocks(NamedTuple):
         _update(before.inverse, image.inverse, image.rays, image.pinhole, size, self)
         return self
 
-    def merged(self, rays: NDArray[np.float32], size: int) -> Blocks:
+    def merged(self, rays: Singles, size: int) -> Blocks:
         """Every 2 x 2 of them as one: blocks of `size` pixels of these rays (H, W, 3)."""
         rows, columns = self.squared.shape
         blocks = self._empty((rows + 1) // 2, (columns + 1) // 2)
@@ -70,7 +71,7 @@ class Blocks(NamedTuple):
         return cls(moments, *(np.empty((rows, columns)) for _ in range(3)))
 
 
-def sum_of_four(values: NDArray[Any]) -> NDArray[np.float64]:
+def sum_of_four(values: NDArray[Any]) -> Floats:
     """Sums over 2 x 2 of values (rows, columns, ...), of fewer at the border."""
     rows, columns, *rest = values.shape
     result = np.zeros(((rows + 1) // 2, (columns + 1) // 2, *rest))
@@ -88,8 +89,8 @@ def for_pixels(values: NDArray, shape: tuple[int, int]) -> NDArray:
 
 @njit(cache=True, nogil=True)
 def _sum_pixels(
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
+    inverse: Singles,
+    rays: Singles,
     pinhole: bool,
     size: int,
     part: tuple[int, int, int, int],
@@ -116,9 +117,7 @@ def _sum_pixels(
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def _fit_planes(
-    rays: NDArray[np.float32], size: int, part: tuple[int, int, int, int], blocks: Blocks
-) -> None:
+def _fit_planes(rays: Singles, size: int, part: tuple[int, int, int, int], blocks: Blocks) -> None:
     """Fill in the planes of blocks whose moments are known."""
     columns, (top, begin, bottom, end) = blocks.squared.shape[1], part
     m = blocks.moments.reshape(-1, SIZE)
@@ -140,12 +139,7 @@ def _fit_planes(
 
 @njit(cache=True, nogil=True)
 def _update(
-    before: NDArray[np.float32],
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
-    pinhole: bool,
-    size: int,
-    blocks: Blocks,
+    before: Singles, inverse: Singles, rays: Singles, pinhole: bool, size: int, blocks: Blocks
 ) -> None:
     """Fill in blocks with pixels that differ from those `before`."""
     height, width = inverse.shape
@@ -163,7 +157,7 @@ def _update(
 @njit(cache=True, inline='always')
 def _change(
     theta: tuple[float, float, float],
-    rays: NDArray[np.float32],
+    rays: Singles,
     corner: tuple[int, int],
     size: int,
     way: tuple[int, int],
@@ -192,7 +186,7 @@ def _change(
 
 
 @njit(cache=True, inline='always')
-def _known(rays: NDArray[np.float32], i: int, j: int) -> Any:
+def _known(rays: Singles, i: int, j: int) -> Any:
     """Whether there is a pixel and it has a ray: a cloud has none where nothing was measured."""
     if i >= rays.shape[0] or j >= rays.shape[1]:
         return False

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Singles
 from rangeseg_ros.core.sensing.blocks import for_pixels
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
@@ -16,9 +16,7 @@ _MEASURED = 4
 _WINDOW = np.ones((3, 3), np.uint8)
 
 
-def bridge_holes(
-    image: RangeImage, steps: NDArray[np.float32], slopes: NDArray[np.float32]
-) -> RangeImage:
+def bridge_holes(image: RangeImage, steps: Singles, slopes: Singles) -> RangeImage:
     """The image with missing pixels as the mean of those around them.
 
     At least half of these are measured, and they continue each other: their inverse ranges differ
@@ -41,7 +39,7 @@ def bridge_holes(
     return replace(image, inverse=np.where(bridged, means[..., 0], inverse), rays=rays)
 
 
-def _sum(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def _sum(values: Singles) -> Singles:
     """Sum of the window around every pixel."""
     result = cv2.boxFilter(values, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
     return np.asarray(result, np.float32)

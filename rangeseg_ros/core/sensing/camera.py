@@ -10,8 +10,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from rangeseg_ros.core.arrays import Floats, Singles
 from rangeseg_ros.core.rotations import rotation_matrix
 from rangeseg_ros.core.sensing.lens import checked_lens, undistort
 
@@ -149,17 +150,17 @@ class Camera:
         return not self.distortion_model and self.skew == 0
 
     @cached_property
-    def axes(self) -> NDArray[np.float64]:
+    def axes(self) -> Floats:
         """(3, 3) what is right, down and forward for the camera, as columns."""
         return rotation_matrix(self.turn)
 
     @property
-    def matrix(self) -> NDArray[np.float64]:
+    def matrix(self) -> Floats:
         """The 3x3 camera matrix K."""
         return np.array([[self.fx, self.skew, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
 
     @cached_property
-    def rays(self) -> NDArray[np.float32]:
+    def rays(self) -> Singles:
         """Directions of the pixels scaled to depth 1, (H, W, 3), so that point = depth * ray.
 
         Zeros where a lens shows no ray.
@@ -174,7 +175,7 @@ class Camera:
         """Median area of a pixel at depth 1, m^2."""
         return pixel_area(self.rays)
 
-    def rays_at(self, u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
+    def rays_at(self, u: ArrayLike, v: ArrayLike) -> Floats:
         """Directions (..., 3) scaled to depth 1 of columns u and rows v (...); NaN without one."""
         with np.errstate(over='ignore', invalid='ignore'):
             y = (np.asarray(v, float) - self.cy) / self.fy
@@ -187,7 +188,7 @@ class Camera:
         return rays if self.turn == OPTICAL else rays @ self.axes.T
 
 
-def pixel_area(rays: NDArray[np.float32]) -> float:
+def pixel_area(rays: Singles) -> float:
     """Median area of a pixel of an image with `rays` (H, W, 3) at inverse range 1, m^2."""
     step = max(1, *(side // 16 for side in rays.shape[:2]))  # a few hundred pixels tell it
     here = rays[::step, ::step].astype(np.float64)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices, Mask, Singles
 from rangeseg_ros.core.rotations import quaternions, rotation_matrix
 from rangeseg_ros.core.sensing.camera import OPTICAL, Camera, CameraError
 
@@ -29,7 +30,7 @@ _GRID = 80  # rows and columns of the grid of pixels that it is fitted to, at mo
 _SMOOTH = 0.5  # largest error, in pixels, of a grid that is smooth
 
 
-def camera_of(points: NDArray[np.floating], valid: NDArray[np.bool_]) -> Camera | None:
+def camera_of(points: NDArray[np.floating], valid: Mask) -> Camera | None:
     """The pinhole camera that points (H, W, 3), metres, lie on the rays of where valid (H, W).
 
     In its optical frame x / z is linear in the column then, and y / z in the row. The camera is at
@@ -67,7 +68,7 @@ def depth_of(points: NDArray[np.floating], camera: Camera) -> NDArray[np.floatin
     return depth
 
 
-def axes_of_frame(rays: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+def axes_of_frame(rays: Singles, valid: Mask) -> Floats:
     """(3, 3) which axes of a cloud's frame are nearest to right, down and forward, as columns.
 
     Of unit rays (H, W, 3) that are known where valid (H, W).
@@ -83,9 +84,7 @@ def axes_of_frame(rays: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArra
     return np.stack([np.cross(down, forward), down, forward], axis=1)
 
 
-def completed_rays(
-    rays: NDArray[np.float32], valid: NDArray[np.bool_]
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]] | None:
+def completed_rays(rays: Singles, valid: Mask) -> tuple[Singles, Mask] | None:
     """Rays (H, W, 3) of a cloud; a polynomial through the valid (H, W) ones tells the others.
 
     Only between these, in their row or column; with the pixels that have a ray then. None where
@@ -117,25 +116,21 @@ def completed_rays(
     return completed, between
 
 
-def _basis(
-    rows: NDArray[np.intp], columns: NDArray[np.intp], shape: tuple[int, int]
-) -> NDArray[np.floating]:
+def _basis(rows: Indices, columns: Indices, shape: tuple[int, int]) -> NDArray[np.floating]:
     """(N, M) Chebyshev polynomials of both coordinates."""
     v, u = (2 * x / max(size - 1, 1) - 1 for x, size in zip((rows, columns), shape, strict=True))
     basis: NDArray[np.floating] = np.polynomial.chebyshev.chebvander2d(v, u, [_DEGREE, _DEGREE])
     return basis
 
 
-def _nearest_axis(
-    vector: NDArray[np.float64], other_than: ArrayLike = (0, 0, 0)
-) -> NDArray[np.float64]:
+def _nearest_axis(vector: Floats, other_than: ArrayLike = (0, 0, 0)) -> Floats:
     """Unit vector (3,) of the axis along which `vector` is longest, other than another one."""
     k = int(np.argmax(np.where(np.equal(other_than, 0), np.abs(vector), -1.0)))
     return np.eye(3)[k] * (-1.0 if vector[k] < 0 else 1.0)
 
 
 def _candidate_frames(
-    points: NDArray[np.float64], u: NDArray[np.intp], v: NDArray[np.intp], shape: tuple[int, int]
+    points: Floats, u: Indices, v: Indices, shape: tuple[int, int]
 ) -> Iterator[tuple[tuple[float, ...], tuple[float, ...]]]:
     """Turns and places of cameras that points (N, 3) of pixels may be from.
 
@@ -177,9 +172,7 @@ def _candidate_frames(
         yield turn, tuple((np.rint(place / _PLACE) * _PLACE).tolist())
 
 
-def _linear_maps(
-    start: NDArray[np.float64], end: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _linear_maps(start: Floats, end: Floats) -> tuple[Floats, Floats]:
     """Matrices (3 K, 3, K) that take vectors (N, K) along unit vectors (N, 3), best ones first.
 
     With the sums (3 K,) of squares of what of the result is across these. The first leads to the
@@ -207,9 +200,7 @@ def _rotation(rays: NDArray[np.floating]) -> tuple[float, ...] | None:
     return tuple(turn.tolist())
 
 
-def _fitted_line(
-    place: NDArray[np.intp], slope: NDArray[np.float64], size: int
-) -> tuple[float, float] | None:
+def _fitted_line(place: Indices, slope: Floats, size: int) -> tuple[float, float] | None:
     """Focal length and centre, pixels, of rays of these slopes (N,) in columns or rows."""
     if not len(place) or 2 * (place.max() - place.min()) <= size - 1:
         return None
@@ -231,7 +222,7 @@ def _camera(*lens: Any, **frame: Any) -> Camera | None:
         return None
 
 
-def _on_rays(points: NDArray[np.floating], valid: NDArray[np.bool_], camera: Camera) -> bool:
+def _on_rays(points: NDArray[np.floating], valid: Mask, camera: Camera) -> bool:
     """Whether all points that were measured lie on the rays of a camera."""
     depth = depth_of(points, camera)
     with np.errstate(invalid='ignore', over='ignore'):

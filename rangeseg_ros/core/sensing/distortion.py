@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Singles
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
@@ -27,10 +27,10 @@ class DistortionMap:
     a u + b v + c over the pixels that were seen is zero.
     """
 
-    offset: NDArray[np.float32]
+    offset: Singles
     # Standard deviation at the distances it was learned from, 0 where it is not known.
-    deviation: NDArray[np.float32] | None = None
-    slope: NDArray[np.float32] | None = None  # None where the error does not depend on y
+    deviation: Singles | None = None
+    slope: Singles | None = None  # None where the error does not depend on y
     camera: Camera | None = None  # whose images it is for, where that is known
     reference: float = 0.0
 
@@ -65,9 +65,7 @@ class DistortionMap:
                 )
 
 
-def in_pixels(
-    cells: NDArray[np.float64], side: int, shape: tuple[int, int]
-) -> NDArray[np.float64]:
+def in_pixels(cells: Floats, side: int, shape: tuple[int, int]) -> Floats:
     """Values of square cells in the pixels (H, W), linear between the middles of the cells."""
     rows, columns = (n * side for n in cells.shape)
     whole = cv2.resize(cells, (columns, rows), interpolation=cv2.INTER_LINEAR)

@@ -12,8 +12,8 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Singles
 from rangeseg_ros.core.config import VGA
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -72,10 +72,10 @@ def decoded(image: RangeImage, q: float) -> RangeImage:
 
 
 # Rays (N, S, 3) of the blocks of a camera, as long as it lives, and their pseudo-inverses.
-_fits: WeakKeyDictionary[Camera, tuple[NDArray[np.float64], ...]] = WeakKeyDictionary()
+_fits: WeakKeyDictionary[Camera, tuple[Floats, ...]] = WeakKeyDictionary()
 
 
-def _blocks(values: NDArray[np.float32], step: int) -> NDArray[np.float64]:
+def _blocks(values: Singles, step: int) -> Floats:
     """Samples (N, S, K) of values (H, W, K) in blocks: every so many pixels."""
     some = values[::step, ::step].astype(np.float64)
     n, (rows, columns) = _SAMPLES, (length // _SAMPLES for length in some.shape[:2])
@@ -84,9 +84,7 @@ def _blocks(values: NDArray[np.float32], step: int) -> NDArray[np.float64]:
 
 
 @njit(cache=True, nogil=True)
-def _shares(
-    inverse: NDArray[np.float32], step: int, rays: NDArray[np.float64], fit: NDArray[np.float64]
-) -> tuple[float, NDArray[np.float64]]:
+def _shares(inverse: Singles, step: int, rays: Floats, fit: Floats) -> tuple[float, Floats]:
     """The least inverse range in blocks, and of each its share of the bend (N, 4).
 
     With its variance by noise, the variance of noise relative to the largest square, and the mean
@@ -127,5 +125,5 @@ def _shares(
 
 
 @njit(cache=True, inline='always')
-def _along(theta: NDArray[np.float64], ray: NDArray[np.float64]) -> float:
+def _along(theta: Floats, ray: Floats) -> float:
     return theta[0] * ray[0] + theta[1] * ray[1] + theta[2] * ray[2]

@@ -10,6 +10,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices, Singles
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.significance import quantile
@@ -55,7 +56,7 @@ class Cells(NamedTuple):
         body = None if image.body is None else image.body[picked]
         return replace(image, rays=rays, inverse=inverse, camera=camera, body=body)
 
-    def _middles(self, size: int, cropped: int) -> NDArray[np.intp]:
+    def _middles(self, size: int, cropped: int) -> Indices:
         """Pixels, along `size` of them, at the centres of cells or behind these."""
         k = self.factor
         return np.clip(k // 2 - cropped + k * np.arange(-(-(size + cropped) // k)), 0, size - 1)
@@ -66,12 +67,12 @@ class Cells(NamedTuple):
         return pixels[self.rows : self.rows + shape[0], self.columns : self.columns + shape[1]]
 
 
-def _depth(inverse: NDArray[np.float32]) -> NDArray[np.float64]:
+def _depth(inverse: Singles) -> Floats:
     """Depth, 0 where it was not measured."""
     return np.divide(1.0, inverse, out=np.zeros(inverse.shape), where=inverse > 0)
 
 
-def _at_centres(depth: NDArray[np.float64], columns: NDArray[np.intp]) -> NDArray[np.float64]:
+def _at_centres(depth: Floats, columns: Indices) -> Floats:
     """Values (N, n) at the centres of cells between columns (n,) and those before, of (N, W).
 
     From the two pixels on each side, between which and the centre the depth is linear.
@@ -127,7 +128,7 @@ def replication(image: RangeImage) -> Cells | None:
     return Cells(factor, rows, columns) if factor == other else None
 
 
-def _period(lines: NDArray[np.float32]) -> tuple[int, int]:
+def _period(lines: Singles) -> tuple[int, int]:
     """Distance of the columns at which values change, and what the first one lacks; 0 for none."""
     lines = np.ascontiguousarray(lines[:: max(len(lines) // _LINES, 1)])
     before, after = lines[:, :-1], lines[:, 1:]
@@ -165,7 +166,7 @@ def interpolation(image: RangeImage) -> Cells | None:
     return Cells(int(periods[-1]), rows, columns, True)
 
 
-def _cropped(lines: NDArray[np.float32], factor: int) -> int:
+def _cropped(lines: Singles, factor: int) -> int:
     """Pixels that the first cell lacks where lines (H, W) are linear between centres of cells."""
     depth = _depth(lines[:: max(len(lines) // _FEW, 1)])
     pixel, error = np.arange(depth.shape[1]), []
@@ -180,9 +181,7 @@ def _cropped(lines: NDArray[np.float32], factor: int) -> int:
     return int(np.argmin(error))
 
 
-def _spectrum(
-    differences: NDArray[Any], distance: NDArray[Any], periods: slice
-) -> NDArray[np.float64]:
+def _spectrum(differences: NDArray[Any], distance: NDArray[Any], periods: slice) -> Floats:
     """Amplitude of the size of differences along lines at each period, in standard errors."""
     size, some = np.abs(differences), slice(None, None, _FEW | 1)
     known, typical = np.isfinite(size), size.ravel()[some]

@@ -7,15 +7,13 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from rangeseg_ros.core.arrays import Mask
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # (H, W-1) and (H-1, W) bool: a jump between a pixel and its right, its lower neighbour.
-GridEdges = tuple[NDArray[np.bool_], NDArray[np.bool_]]
+GridEdges = tuple[Mask, Mask]
 
 
 class Grid(NamedTuple):
@@ -24,8 +22,8 @@ class Grid(NamedTuple):
     False where disconnected.
     """
 
-    right: NDArray[np.bool_]
-    below: NDArray[np.bool_]
+    right: Mask
+    below: Mask
 
 
 class View(NamedTuple):

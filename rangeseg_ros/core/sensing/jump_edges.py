@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from rangeseg_ros.core.arrays import Mask, Singles
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.grid import GridEdges
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -65,7 +66,7 @@ def plane_deviation(
     return jumps
 
 
-def _along_rows(limit: NDArray[np.float32], shape: tuple[int, int]) -> NDArray[np.float32]:
+def _along_rows(limit: Singles, shape: tuple[int, int]) -> Singles:
     """Values (rows of blocks, W) from one value or those of all blocks."""
     blocks = np.broadcast_to(limit, (-(-shape[0] // BLOCK), -(-shape[1] // BLOCK)))
     return np.ascontiguousarray(blocks.repeat(BLOCK, axis=1)[:, : shape[1]])
@@ -86,9 +87,7 @@ def _framed(values: NDArray[Any]) -> NDArray[Any]:
 
 
 @njit(cache=True, nogil=True)
-def _find_deviations(
-    means: NDArray[np.float32], limits: NDArray[np.float32], down: bool, result: NDArray[np.bool_]
-) -> None:
+def _find_deviations(means: Singles, limits: Singles, down: bool, result: Mask) -> None:
     """Whether the windows on either side of boundaries deviate from those beyond."""
     for i in range(len(result)):
         a, b = _shifted(means, i, -4, down), _shifted(means, i, -1, down)
@@ -100,12 +99,12 @@ def _find_deviations(
 
 @njit(cache=True, nogil=True)
 def _find_crossings(
-    pixels: NDArray[np.float32],
+    pixels: Singles,
     sides: NDArray[np.uint8],
-    limits: NDArray[np.float32],
-    clear: NDArray[np.float32],
+    limits: Singles,
+    clear: Singles,
     down: bool,
-    result: NDArray[np.bool_],
+    result: Mask,
 ) -> None:
     """Jumps between pixels, see `plane_deviation`."""
     for i in range(len(result)):
@@ -121,7 +120,7 @@ def _find_crossings(
 
 
 @njit(cache=True, inline='always')
-def _shifted(values: NDArray[np.float32], i: int, offset: int, down: bool) -> NDArray[np.float32]:
+def _shifted(values: Singles, i: int, offset: int, down: bool) -> Singles:
     """Row i of framed values, or what lies `offset` further down or to the right."""
     if down:
         return values[_FRAME + i + offset, _FRAME:]
@@ -179,7 +178,7 @@ def sobel(image: RangeImage) -> GridEdges:
     return horizontal, vertical
 
 
-def pixels_beside(edges: GridEdges) -> NDArray[np.bool_]:
+def pixels_beside(edges: GridEdges) -> Mask:
     """Pixels (H, W) that a jump separates from one of their four neighbours or more."""
     right, below = edges
     pixels = np.zeros((len(right), below.shape[1]), np.bool_)
@@ -196,7 +195,7 @@ _PATTERNS = [(_RING & pattern > 0).view(np.uint8) for pattern in range(256)]
 _JOINS = np.array([cv2.connectedComponents(ring)[0] > 2 for ring in _PATTERNS])
 
 
-def bridge_edges(edges: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def bridge_edges(edges: Mask) -> Mask:
     """Add every pixel that joins neighbours which do not touch each other (thesis 2.4)."""
     kernel, pixels = _RING.astype(np.float32), edges.view(np.uint8)
     pattern = cv2.filter2D(pixels, cv2.CV_16S, kernel, borderType=cv2.BORDER_CONSTANT)

@@ -23,6 +23,8 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats
+
 # Numbers of coefficients that OpenCV takes; the last two of 14 are the tilt of the sensor.
 _COUNTS = {'plumb_bob': (4, 5), 'rational_polynomial': (4, 5, 8, 12, 14), 'equidistant': (4,)}
 MODELS = tuple(_COUNTS)
@@ -61,9 +63,7 @@ def checked_lens(model: str, coefficients: Sequence[float]) -> tuple[str, tuple[
     return (model, d[:12]) if any(d) else ('', ())
 
 
-def undistort(
-    x: NDArray[np.float64], y: NDArray[np.float64], model: str, d: Sequence[float]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def undistort(x: Floats, y: Floats, model: str, d: Sequence[float]) -> tuple[Floats, Floats]:
     """Points (...) of the plane that appear at (x, y), NaN where no ray comes from.
 
     The lens is as `checked_lens` returns it.
@@ -108,5 +108,5 @@ def _lens(model: str, d: Sequence[float]) -> Callable[[Complex], tuple[Complex, 
     return lens
 
 
-def _square(z: Complex) -> NDArray[np.float64]:
+def _square(z: Complex) -> Floats:
     return z.real**2 + z.imag**2

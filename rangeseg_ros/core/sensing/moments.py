@@ -17,6 +17,8 @@ from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Singles
+
 SIZE = 13  # of the vector of sums
 # Entries: w y^2, number of pixels, sums of the two variance ratios.
 CHI2, COUNT, RATIO, SLOPE = 9, 10, 11, 12
@@ -35,7 +37,7 @@ def cofactors(a: Any, b: Any, c: Any, d: Any, e: Any, f: Any) -> tuple[Any, ...]
 
 
 @njit(cache=True, inline='always')
-def ray_of(rays: NDArray[np.float32], pinhole: bool, i: int, j: int) -> tuple[Any, Any, Any]:
+def ray_of(rays: Singles, pinhole: bool, i: int, j: int) -> tuple[Any, Any, Any]:
     """Ray of a pixel; of a pinhole camera from the first row and column, which stay in cache."""
     row, column = (0, 0) if pinhole else (i, j)
     return rays[row, j, 0], rays[i, column, 1], rays[row, j, 2]
@@ -67,8 +69,8 @@ def plus_pixel(
 
 @njit(cache=True, inline='always')
 def add_pixel(
-    moments: NDArray[np.float64],
-    ray: NDArray[np.float32] | tuple[Any, Any, Any],
+    moments: Floats,
+    ray: Singles | tuple[Any, Any, Any],
     inverse: float,
     weight: float,
     ratio: float,
@@ -105,7 +107,7 @@ def plane_of(sums: tuple[float, ...]) -> tuple[float, float, float, float]:
 
 
 @njit(cache=True, inline='always')
-def sums_of(moments: NDArray[np.float64], k: int) -> tuple[float, ...]:
+def sums_of(moments: Floats, k: int) -> tuple[float, ...]:
     """The first ten sums of one of N moment vectors (N, 13)."""
     return (
         moments[k, 0],
@@ -122,14 +124,14 @@ def sums_of(moments: NDArray[np.float64], k: int) -> tuple[float, ...]:
 
 
 @njit(cache=True, error_model='numpy')
-def fit(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
+def fit(moments: Floats, theta: Floats) -> float:
     """Write the plane of moments (13,), or zeros, to theta (3,); sum of the squared residuals."""
     theta[0], theta[1], theta[2], left = plane_of(sums_of(moments.reshape(1, -1), 0))
     return left
 
 
 @njit(cache=True)
-def squares_left(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
+def squares_left(moments: Floats, theta: Floats) -> float:
     """Weighted sum of the squared residuals that a plane theta (3,) leaves of moments (13,)."""
     a, b, c = theta[0], theta[1], theta[2]
     square = a * (a * moments[0] + 2 * (b * moments[1] + c * moments[2]))
@@ -138,7 +140,7 @@ def squares_left(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> fl
 
 
 @njit(cache=True, error_model='numpy')
-def common_residual(moments: NDArray[np.float64], k: int, m: int) -> float:
+def common_residual(moments: Floats, k: int, m: int) -> float:
     """What `fit` returns for the sum of two of N moment vectors (N, 13), without views of them.
 
     Call it with numbers of type intp: it is compiled once for each type of integer.
@@ -159,7 +161,7 @@ def common_residual(moments: NDArray[np.float64], k: int, m: int) -> float:
 
 
 @njit(cache=True)
-def fit_all(moments: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def fit_all(moments: Floats) -> tuple[Floats, Floats]:
     """Planes (N, 3) and residual sums (N,) of moment vectors (N, 13)."""
     theta = np.zeros((len(moments), 3))
     residual = np.zeros(len(moments))
@@ -169,9 +171,7 @@ def fit_all(moments: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 
 
 @njit(cache=True, nogil=True)
-def sum_by_label(
-    labels: NDArray[np.integer], values: NDArray[np.float64], count: int
-) -> NDArray[np.float64]:
+def sum_by_label(labels: NDArray[np.integer], values: Floats, count: int) -> Floats:
     """Sums (count, K) of the values (N, K) of each of the labels (N,) above 0."""
     total = np.zeros((count, values.shape[1]))
     for n in range(len(labels)):

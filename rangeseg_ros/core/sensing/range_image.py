@@ -10,6 +10,7 @@ from numbers import Real
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rangeseg_ros.core.arrays import Floats, Mask, Singles
 from rangeseg_ros.core.sensing.camera import OPTICAL, Camera, pixel_area
 from rangeseg_ros.core.sensing.clouds import axes_of_frame, camera_of, depth_of
 
@@ -50,11 +51,11 @@ class RangeImage:
         Pixels that show the robot itself, which are not measured; None where no mask tells.
     """
 
-    rays: NDArray[np.float32]
-    inverse: NDArray[np.float32]
+    rays: Singles
+    inverse: Singles
     camera: Camera | None = None
     corrected: bool = False
-    body: NDArray[np.bool_] | None = None
+    body: Mask | None = None
 
     def __post_init__(self) -> None:
         # Like those of cameras, or every kernel that reads them is compiled twice.
@@ -191,7 +192,7 @@ class RangeImage:
         with np.errstate(divide='ignore'):
             return replace(self, inverse=_reciprocal(1 / self.inverse + noise, 1.0))
 
-    def without(self, body: NDArray[np.bool_]) -> RangeImage:
+    def without(self, body: Mask) -> RangeImage:
         """Copy without the pixels that show the robot's own body: (H, W), of the image's size."""
         (height, width), (rows, columns) = body.shape, self.shape
         if body.shape != self.shape:
@@ -217,7 +218,7 @@ class RangeImage:
         return self.camera is not None and self.camera.pinhole and self.camera.turn == OPTICAL
 
     @cached_property
-    def axes(self) -> NDArray[np.float64]:
+    def axes(self) -> Floats:
         """(3, 3) what is right, down and forward in the image, as columns, in its frame.
 
         The identity in an optical frame. Of clouds of other sensors, the nearest axes.
@@ -227,12 +228,12 @@ class RangeImage:
         return axes_of_frame(self.rays, self.valid)
 
     @property
-    def place(self) -> NDArray[np.float64]:
+    def place(self) -> Floats:
         """(3,) where the sensor is in the frame of the points, metres."""
         return np.array(self.camera.place if self.camera is not None else (0.0, 0.0, 0.0))
 
     @property
-    def level_up(self) -> NDArray[np.float64]:
+    def level_up(self) -> Floats:
         """(3,) up in the frame of the image where that is level.
 
         By REP 103: -y in optical frames, which look along z, and z in all others.
@@ -241,11 +242,11 @@ class RangeImage:
         return np.array([0.0, -1, 0] if looks[2] > np.abs(looks[:2]).max() else [0.0, 0, 1])
 
     @property
-    def along(self) -> NDArray[np.float32]:
+    def along(self) -> Singles:
         """(H, W) inverse range over inverse depth, the distance along the optical axis."""
         if self.camera is not None:
             return np.ones(self.shape, np.float32)
-        along: NDArray[np.float32] = self.rays @ self.axes[:, 2].astype(np.float32)
+        along: Singles = self.rays @ self.axes[:, 2].astype(np.float32)
         return along
 
     @cached_property
@@ -254,12 +255,12 @@ class RangeImage:
         return pixel_area(self.rays) if self.camera is None else self.camera.pixel_area
 
     @cached_property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> Mask:
         """(H, W) True where there is a measurement; the rest is shadow (thesis 6.7)."""
         return self.inverse > 0
 
     @cached_property
-    def points(self) -> NDArray[np.float32]:
+    def points(self) -> Singles:
         """(H, W, 3) points in metres, NaN where nothing was measured."""
         with np.errstate(divide='ignore', invalid='ignore'):
             points = self.rays / self.inverse[..., None]
@@ -272,7 +273,7 @@ class RangeImage:
 _NEAREST, _FARTHEST = 1e-6, 1e6
 
 
-def _reciprocal(distance: NDArray, scale: float) -> NDArray[np.float32]:
+def _reciprocal(distance: NDArray, scale: float) -> Singles:
     """1 / (scale * distance) in 1/m, 0 where that is no distance from 1 um to 1000 km."""
     if distance.dtype == np.uint16:
         # No index is beyond the table; without a look for one it takes a third of the time.
@@ -285,14 +286,14 @@ def _reciprocal(distance: NDArray, scale: float) -> NDArray[np.float32]:
 
 
 @lru_cache(maxsize=4)
-def _reciprocals(scale: float) -> NDArray[np.float32]:
+def _reciprocals(scale: float) -> Singles:
     """Of the 65536 values there can be."""
     inverse = _reciprocal(np.arange(65536, dtype=np.float64), scale)
     inverse[NOT_MEASURED] = 0
     return inverse
 
 
-def _unmasked(values: ArrayLike) -> tuple[NDArray, NDArray[np.bool_] | None]:
+def _unmasked(values: ArrayLike) -> tuple[NDArray, Mask | None]:
     """Values as a plain array, and where a mask hides them."""
     if isinstance(values, np.ma.MaskedArray):
         return values.data, np.ma.getmaskarray(values)

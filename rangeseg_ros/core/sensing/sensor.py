@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 from numba.extending import register_jitable
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.config import VGA, Config
 
 # Widths of the kernel that an error is smoothed with, which its correlations along a line sum to.
@@ -182,7 +182,7 @@ FLOOR = 1e-12
 
 
 @register_jitable(inline='always')
-def random_variance(sensor: SensorModel, squared: NDArray[np.float64] | float) -> Any:
+def random_variance(sensor: SensorModel, squared: Floats | float) -> Any:
     """Variance of the random error at the square of an inverse range, (1/m)^2.
 
     An error ds of the range is one of ds / s^2 of its inverse.
@@ -197,6 +197,6 @@ def tilt_variance(sensor: SensorModel, slope: Any) -> Any:
 
 
 @register_jitable(inline='always')
-def systematic_variance(sensor: SensorModel, squared: NDArray[np.float64] | float) -> Any:
+def systematic_variance(sensor: SensorModel, squared: Floats | float) -> Any:
     """Variance of the systematic error at the square of an inverse range, (1/m)^2."""
     return sensor.distortion**2 + (sensor.range_distortion * squared) ** 2

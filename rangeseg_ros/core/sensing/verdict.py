@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices, Labels, Singles
 from rangeseg_ros.core.sensing.enlargement import SIGNIFICANT, enlargement
 from rangeseg_ros.core.sensing.range_image import FAR, NEAR, RangeImage
 from rangeseg_ros.core.significance import OUTLIER, quantile
@@ -58,9 +58,9 @@ class Verdict(NamedTuple):
 
 def judge(
     image: RangeImage,
-    labels: NDArray[np.uint16],
-    planes: Mapping[int, NDArray[np.float64]],
-    curved: NDArray[np.uint16] | None = None,
+    labels: Labels,
+    planes: Mapping[int, Floats],
+    curved: Labels | None = None,
     identified: bool = True,
     values: str = 'depth',
 ) -> Verdict:
@@ -159,7 +159,7 @@ def filled_share(image: RangeImage) -> float:
     return most
 
 
-def _excess(lines: NDArray[np.float32], at: NDArray[np.intp]) -> NDArray[np.intp]:
+def _excess(lines: Singles, at: Indices) -> Indices:
     """By how many pixels runs of a value up to those `at` (N,) exceed measured runs before."""
     begins = np.flatnonzero(np.diff(lines, axis=1, prepend=np.float32(-1)))
     last = np.searchsorted(begins, at, 'right') - 1
@@ -168,9 +168,7 @@ def _excess(lines: NDArray[np.float32], at: NDArray[np.intp]) -> NDArray[np.intp
     return np.asarray((at + 1 - 2 * here + there)[known])
 
 
-def shows_range(
-    image: RangeImage, labels: NDArray[np.uint16], planes: Mapping[int, NDArray[np.float64]]
-) -> bool:
+def shows_range(image: RangeImage, labels: Labels, planes: Mapping[int, Floats]) -> bool:
     """Whether the planes are bent as those are whose range was taken for depth.
 
     Of a plane theta . ray = 1/z the range gives (theta . ray) / |ray|. Each plane tells its share
@@ -192,9 +190,7 @@ def shows_range(
     return bool(odds > ODDS)
 
 
-def _share_of_range(
-    rays: NDArray[np.float64], inverse: NDArray[np.float32], theta: NDArray[np.float64]
-) -> tuple[float, float]:
+def _share_of_range(rays: Floats, inverse: Singles, theta: Floats) -> tuple[float, float]:
     """Share of the bend in one plane, and its variance; what does not fit is left out."""
     bend = (rays @ theta) * (1 / np.linalg.norm(rays, axis=1) - 1)
     terms = np.column_stack([rays, bend])

@@ -8,8 +8,8 @@ plane passes c below p along n. No covariance of x is singular, as that of (norm
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Mask
 from rangeseg_ros.core.significance import chi2_quantile
 
 # Chi-squared, with the three degrees of freedom of a plane, up to which two planes may be one.
@@ -25,25 +25,17 @@ NARROWEST = 0.01
 SURE_TURN, FARTHEST = np.radians(15.0), 0.1
 
 
-def candidates(
-    first: tuple[NDArray[np.float64], NDArray[np.float64]],
-    second: tuple[NDArray[np.float64], NDArray[np.float64]],
-    reach: NDArray[np.float64],
-) -> NDArray[np.bool_]:
+def candidates(first: tuple[Floats, Floats], second: tuple[Floats, Floats], reach: Floats) -> Mask:
     """(N, M) which planes are near enough in angle and offset to be asked of the gate.
 
     Of the first, normals (N, 3) and distances (N,); of the second, normals and points (M, 3) on
     the planes, which are so far (M,) from the camera, metres.
     """
-    near: NDArray[np.bool_] = first[0] @ second[0].T > np.cos(SURE_TURN)
+    near: Mask = first[0] @ second[0].T > np.cos(SURE_TURN)
     return near & (np.abs(first[0] @ second[1].T + first[1][:, None]) < FARTHEST * reach)
 
 
-def with_floor(
-    spread: NDArray[np.float64],
-    reach: NDArray[np.float64],
-    width: NDArray[np.float64] | float = np.inf,
-) -> NDArray[np.float64]:
+def with_floor(spread: Floats, reach: Floats, width: Floats | float = np.inf) -> Floats:
     """Covariances (K, 3, 3) of differences, with what planes of one surface differ by anyway.
 
     Where both are looked at, so that c is independent of a and b, so far from the camera. `width`
@@ -56,14 +48,14 @@ def with_floor(
     return result
 
 
-def mahalanobis(gap: NDArray[np.float64], spread: NDArray[np.float64]) -> NDArray[np.float64]:
+def mahalanobis(gap: Floats, spread: Floats) -> Floats:
     """Squared Mahalanobis distances (K,) of `gap` (K, D) with covariances `spread` (K, D, D)."""
-    value: NDArray[np.float64]
+    value: Floats
     value = (gap * np.linalg.solve(spread, gap[..., None])[..., 0]).sum(axis=1)
     return value
 
 
-def tangents(normal: NDArray[np.float64]) -> NDArray[np.float64]:
+def tangents(normal: Floats) -> Floats:
     """Two unit vectors across each unit normal (N, 3), right-handed with it: (N, 2, 3).
 
     Duff et al., "Building an orthonormal basis, revisited", JCGT 6(1), 2017.
@@ -78,7 +70,7 @@ def tangents(normal: NDArray[np.float64]) -> NDArray[np.float64]:
     return axes
 
 
-def to_errors(axes: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.float64]:
+def to_errors(axes: Floats, point: Floats) -> Floats:
     """(K, 3, 4) from (normal, distance) to (a, b, c) of planes with `axes` (K, 2, 3)."""
     local = np.zeros((len(axes), 3, 4))
     local[:, :2, :3] = axes
@@ -87,7 +79,7 @@ def to_errors(axes: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[
     return local
 
 
-def from_errors(axes: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.float64]:
+def from_errors(axes: Floats, point: Floats) -> Floats:
     """(K, 4, 3) from (a, b, c) to (normal, distance)."""
     jacobian = np.zeros((len(axes), 4, 3))
     jacobian[:, :3, :2] = axes.transpose(0, 2, 1)
@@ -97,11 +89,8 @@ def from_errors(axes: NDArray[np.float64], point: NDArray[np.float64]) -> NDArra
 
 
 def shifted(
-    normal: NDArray[np.float64],
-    point: NDArray[np.float64],
-    axes: NDArray[np.float64],
-    step: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    normal: Floats, point: Floats, axes: Floats, step: Floats
+) -> tuple[Floats, Floats, Floats]:
     """Normals, points and axes of planes without the errors `step` (K, 3).
 
     The axes turn with their plane.
@@ -115,9 +104,7 @@ def shifted(
     return normal, point - step[:, 2:] * normal, axes
 
 
-def by_motion(
-    normal: NDArray[np.float64], axes: NDArray[np.float64], point: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def by_motion(normal: Floats, axes: Floats, point: Floats) -> Floats:
     """(K, 3, 6) derivatives of (a, b, c) of planes seen, by a motion of the planes expected.
 
     The motion is a turn about the origin of `point`, radians, and a shift, metres.
@@ -129,13 +116,13 @@ def by_motion(
     return design
 
 
-def congruent(by: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+def congruent(by: Floats, covariance: Floats) -> Floats:
     """B C B^T of stacked matrices: the covariance of B x where C is that of x."""
-    result: NDArray[np.float64] = by @ covariance @ np.swapaxes(by, -1, -2)
+    result: Floats = by @ covariance @ np.swapaxes(by, -1, -2)
     return result
 
 
-def moved_plane(rotation: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.float64]:
+def moved_plane(rotation: Floats, shift: Floats) -> Floats:
     """(4, 4) from (normal, distance) to those in a frame in which x is at rotation x + shift."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[3, :3] = rotation, -shift @ rotation

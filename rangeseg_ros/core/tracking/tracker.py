@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Indices, Labels, Mask
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.rotations import rotation_by
@@ -42,7 +43,7 @@ _MOTION_ROUNDS, _SETTLED = 3, 0.01
 # Rows or columns, whichever are fewer, at which overlap is looked at: a plane of the least size
 # has about eight samples in a 640 x 480 image.
 _SAMPLES = 60
-Motion = tuple[NDArray[np.float64], NDArray[np.float64]]
+Motion = tuple[Floats, Floats]
 """Rotation (3, 3) and shift (3,) that take points of one frame to another."""
 
 
@@ -51,16 +52,16 @@ class Tracks(NamedTuple):
 
     id: NDArray[np.int64]
     surface: NDArray[np.int64]
-    plane: NDArray[np.float64]  # (N, 4), normals and distances
-    covariance: NDArray[np.float64]  # (N, 4, 4)
-    centroid: NDArray[np.float64]  # (N, 3)
-    width: NDArray[np.float64]  # half of that of the rectangle around each plane, metres
-    reach: NDArray[np.float64]  # half of its diagonal
-    unseen: NDArray[np.float64]  # seconds since they were last seen
-    mask: NDArray[np.bool_]  # (N, S), in which samples of the label image that was
+    plane: Floats  # (N, 4), normals and distances
+    covariance: Floats  # (N, 4, 4)
+    centroid: Floats  # (N, 3)
+    width: Floats  # half of that of the rectangle around each plane, metres
+    reach: Floats  # half of its diagonal
+    unseen: Floats  # seconds since they were last seen
+    mask: Mask  # (N, S), in which samples of the label image that was
 
     @classmethod
-    def of(cls, planes: Sequence[Plane], labels: NDArray[np.uint16]) -> Tracks:
+    def of(cls, planes: Sequence[Plane], labels: Labels) -> Tracks:
         """Planes seen now in a label image (H, W), without ids (0)."""
         step = max(min(labels.shape) // _SAMPLES, 1)
         coarse = labels[step // 2 :: step, step // 2 :: step].ravel()
@@ -79,11 +80,11 @@ class Tracks(NamedTuple):
         )
 
     @property
-    def size(self) -> NDArray[np.intp]:
+    def size(self) -> Indices:
         """(N,) number of samples of each plane."""
         return self.mask.sum(axis=1)
 
-    def shared(self, others: Tracks) -> NDArray[np.intp]:
+    def shared(self, others: Tracks) -> Indices:
         """(N, M) samples in common with the planes of one image, which have none in common.
 
         Counted, as a product of matrices wakes all threads of the linear algebra, which then spin.
@@ -94,11 +95,11 @@ class Tracks(NamedTuple):
         return np.array(counts, np.intp).reshape(len(self.id), count)
 
     @property
-    def range(self) -> NDArray[np.float64]:
+    def range(self) -> Floats:
         """(N,) distances of the centroids from the camera, metres."""
         return np.asarray(np.linalg.norm(self.centroid, axis=1))
 
-    def moved(self, rotation: NDArray[np.float64], shift: NDArray[np.float64]) -> Tracks:
+    def moved(self, rotation: Floats, shift: Floats) -> Tracks:
         """The planes in a frame in which x is at rotation x + shift."""
         jacobian = moved_plane(rotation, shift)
         return self._replace(
@@ -107,7 +108,7 @@ class Tracks(NamedTuple):
             centroid=self.centroid @ rotation.T + shift,
         )
 
-    def where(self, chosen: NDArray[np.bool_]) -> Tracks:
+    def where(self, chosen: Mask) -> Tracks:
         """Some of the planes."""
         return Tracks._make(part[chosen] for part in self)
 
@@ -146,11 +147,7 @@ class Tracker:
         self._tracks: Tracks | None = None
 
     def track(
-        self,
-        labels: NDArray[np.uint16],
-        planes: Sequence[Plane],
-        stamp: int,
-        motion: Motion | None = None,
+        self, labels: Labels, planes: Sequence[Plane], stamp: int, motion: Motion | None = None
     ) -> list[Plane]:
         """The planes of the next frame, of labels (H, W), with their `id` and `surface`.
 
@@ -207,15 +204,15 @@ class Tracker:
         return surfaces
 
 
-def _near(known: Tracks, seen: Tracks) -> NDArray[np.bool_]:
+def _near(known: Tracks, seen: Tracks) -> Mask:
     """(T, N) see `candidates`."""
     first, second = (known.plane[:, :3], known.plane[:, 3]), (seen.plane[:, :3], seen.centroid)
     return candidates(first, second, seen.range)
 
 
 def _differences(
-    known: Tracks, seen: Tracks, t: NDArray[np.intp], s: NDArray[np.intp]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    known: Tracks, seen: Tracks, t: Indices, s: Indices
+) -> tuple[Floats, Floats, Floats, Floats]:
     """What planes `s` (K,) seen differ by from known planes `t`, at the centroids of the former.
 
     As errors (K, 3) of the known planes, with covariances (K, 3, 3), tangents (K, 2, 3) of the
@@ -233,11 +230,7 @@ def _differences(
 
 
 def _camera_motion(
-    known: Tracks,
-    seen: Tracks,
-    pairs: tuple[NDArray[np.intp], ...],
-    prior: NDArray[np.float64],
-    told: Motion | None,
+    known: Tracks, seen: Tracks, pairs: tuple[Indices, ...], prior: Floats, told: Motion | None
 ) -> Motion:
     """Motion of the known planes to those that are seen, of sure pairs of them.
 
@@ -263,7 +256,7 @@ def _camera_motion(
     return rotation, shift
 
 
-def _assign(known: Tracks, seen: Tracks, shared: NDArray[np.intp]) -> NDArray[np.intp]:
+def _assign(known: Tracks, seen: Tracks, shared: Indices) -> Indices:
     """(N,) id of the known plane that each plane is, 0 for none."""
     # Here, as it takes as long to import as a frame and is for sequences only.
     from scipy.optimize import linear_sum_assignment

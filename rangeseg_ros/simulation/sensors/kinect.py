@@ -14,6 +14,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Mask, Singles
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.simulation.fields import smooth_field
 from rangeseg_ros.simulation.sensors.sensor import (
@@ -52,8 +53,8 @@ class Kinect(Sensor):
             raise ValueError(f'noise must be one of {", ".join(NOISES)}, not {self.noise!r}')
 
     def measure(
-        self, depth: NDArray[np.float64], camera: Camera, random: np.random.Generator
-    ) -> NDArray[np.uint16] | NDArray[np.float32]:
+        self, depth: Floats, camera: Camera, random: np.random.Generator
+    ) -> NDArray[np.uint16] | Singles:
         inverse = inverse_depth(depth)
         share = SHADOW_SHARE if self.noise == 'measured' else 1.0
         blind = ~np.isfinite(depth) | unseen_from_the_right(inverse, camera, share * BASELINE)
@@ -72,8 +73,8 @@ class Kinect(Sensor):
         return millimetres(1 / (QUANTUM * np.maximum(np.rint(disparity), 1)), ~blind)
 
     def _measured(
-        self, depth: NDArray[np.float64], slope: NDArray[np.float64], random: np.random.Generator
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        self, depth: Floats, slope: Floats, random: np.random.Generator
+    ) -> tuple[Floats, Mask]:
         """Disparity as real sensors see `depth`, quanta before rounding, and what they do not see.
 
         The sum of the true disparity, `sensor_pattern`, a smooth distortion new in every frame
@@ -100,7 +101,7 @@ def kinect_camera(width: int = 640, height: int = 480) -> Camera:
 
 
 @lru_cache(maxsize=4)
-def sensor_pattern(shape: tuple[int, ...], sensor_seed: int) -> NDArray[np.float64]:
+def sensor_pattern(shape: tuple[int, ...], sensor_seed: int) -> Floats:
     """Fixed error of one sensor, (H, W) quanta of disparity.
 
     A smooth distortion (standard deviation 0.5, correlated over 26 columns and 45 rows of a
@@ -122,7 +123,7 @@ def sensor_pattern(shape: tuple[int, ...], sensor_seed: int) -> NDArray[np.float
         first = random.uniform(0, period)
     step *= random.choice([-1, 1])
     bands = step * (((column - first) / period) % 1 - 0.5)
-    pattern: NDArray[np.float64] = distortion + bands
+    pattern: Floats = distortion + bands
     pattern.setflags(write=False)
     return pattern
 

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.simulation.fields import smooth_field
 from rangeseg_ros.simulation.sensors.sensor import Sensor, inverse_depth, millimetres
@@ -37,7 +38,7 @@ class Lidar(Sensor):
     camera = Camera(256, 192, 212.0, 212.0, 127.5, 95.5)
 
     def measure(
-        self, depth: NDArray[np.float64], camera: Camera, random: np.random.Generator
+        self, depth: Floats, camera: Camera, random: np.random.Generator
     ) -> NDArray[np.uint16]:
         # Blurred in inverse depth, in which surfaces stay plane.
         inverse = cv2.GaussianBlur(inverse_depth(depth), (0, 0), _BLUR)

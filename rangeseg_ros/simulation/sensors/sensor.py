@@ -9,6 +9,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Mask, Singles
 from rangeseg_ros.core.sensing.camera import Camera
 
 
@@ -32,8 +33,8 @@ class Sensor(ABC):
 
     @abstractmethod
     def measure(
-        self, depth: NDArray[np.float64], camera: Camera, random: np.random.Generator
-    ) -> NDArray[np.uint16] | NDArray[np.float32]:
+        self, depth: Floats, camera: Camera, random: np.random.Generator
+    ) -> NDArray[np.uint16] | Singles:
         """Depth image (H, W) as the sensor delivers it: millimetres, or metres as float32.
 
         Both the image, where 0 stands for no measurement, and the true `depth` (metres, inf where
@@ -46,9 +47,7 @@ class Ideal(Sensor):
 
     camera = Camera(640, 480, 585.0, 585.0, 319.5, 239.5)
 
-    def measure(
-        self, depth: NDArray[np.float64], camera: Camera, random: np.random.Generator
-    ) -> NDArray[np.float32]:
+    def measure(self, depth: Floats, camera: Camera, random: np.random.Generator) -> Singles:
         return np.where(np.isfinite(depth), depth, 0).astype(np.float32)
 
 
@@ -58,12 +57,12 @@ def resize(camera: Camera, width: int, height: int) -> Camera:
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
-def inverse_depth(depth: NDArray[np.float64]) -> NDArray[np.float64]:
+def inverse_depth(depth: Floats) -> Floats:
     """1/z, 1/m; 0 where there is nothing."""
     return 1 / np.maximum(depth, 1e-3)
 
 
-def slopes(inverse: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+def slopes(inverse: Floats, camera: Camera) -> Floats:
     """Tangent of the angle of incidence of every pixel's surface.
 
     A plane is theta . ray = 1/z, so the derivatives of 1/z along rows and columns give its
@@ -79,7 +78,7 @@ def slopes(inverse: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
     return np.sqrt(1 - cosine**2) / cosine
 
 
-def _derivative(image: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+def _derivative(image: Floats, axis: int) -> Floats:
     step = np.diff(image, axis=axis)
     first, last = np.take(step, [0], axis), np.take(step, [-1], axis)
     forward = np.concatenate([step, last], axis)
@@ -87,9 +86,7 @@ def _derivative(image: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
     return np.where(np.abs(forward) < np.abs(backward), forward, backward)
 
 
-def unseen_from_the_right(
-    inverse: NDArray[np.float64], camera: Camera, baseline: float
-) -> NDArray[np.bool_]:
+def unseen_from_the_right(inverse: Floats, camera: Camera, baseline: float) -> Mask:
     """Pixels that a second view, `baseline` metres to the right, does not see.
 
     A pixel lands at u - f b / z in that view (rectified stereo); a pixel further right that
@@ -103,7 +100,7 @@ def unseen_from_the_right(
     return hidden
 
 
-def millimetres(depth: NDArray[np.float64], seen: NDArray[np.bool_]) -> NDArray[np.uint16]:
+def millimetres(depth: Floats, seen: Mask) -> NDArray[np.uint16]:
     """Depth image in millimetres; 0 where nothing is seen or 16 bits do not hold it."""
     values = np.rint(1000 * np.where(seen, depth, 0))
     return np.where((values >= 1) & (values <= 65535), values, 0).astype(np.uint16)

@@ -33,6 +33,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.simulation.fields import smooth_field
 from rangeseg_ros.simulation.sensors.sensor import (
@@ -62,7 +63,7 @@ class RealSense(Sensor):
     camera = Camera(848, 480, 424.0, 424.0, 423.5, 239.5)
 
     def measure(
-        self, depth: NDArray[np.float64], camera: Camera, random: np.random.Generator
+        self, depth: Floats, camera: Camera, random: np.random.Generator
     ) -> NDArray[np.uint16]:
         true = inverse_depth(depth)
         inverse = _fattened(true, random)
@@ -82,21 +83,19 @@ class RealSense(Sensor):
 
 
 @lru_cache(maxsize=4)
-def distortion(shape: tuple[int, int], seed: int) -> NDArray[np.float64]:
+def distortion(shape: tuple[int, int], seed: int) -> Floats:
     """Fixed error of the inverse depth of one sensor, (H, W) 1/m."""
     height, width = shape
     random = np.random.default_rng([seed, 10])
     v, u = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
     bowl = random.choice([-1, 1]) * random.uniform(0.5, 1) * _BOWL * (u**2 + v**2 - 2 / 3)
     waves = _WAVES * smooth_field(shape, (0.07 * width, 0.07 * width), random)
-    pattern: NDArray[np.float64] = bowl + waves
+    pattern: Floats = bowl + waves
     pattern.setflags(write=False)
     return pattern
 
 
-def _matching_noise(
-    disparity: NDArray[np.float64], random: np.random.Generator
-) -> NDArray[np.float64]:
+def _matching_noise(disparity: Floats, random: np.random.Generator) -> Floats:
     """Error of the disparity, pixels: alike where position and subpixel phase are alike."""
     noise = _WHITE * random.standard_normal(disparity.shape)
     for width, deviation, period in _BLOBS:
@@ -106,7 +105,7 @@ def _matching_noise(
     return noise
 
 
-def _fattened(inverse: NDArray[np.float64], random: np.random.Generator) -> NDArray[np.float64]:
+def _fattened(inverse: Floats, random: np.random.Generator) -> Floats:
     """Inverse depth with silhouettes displaced by about two pixels, mostly outwards."""
     shape = inverse.shape
     nearer = cv2.dilate(inverse, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5)))
@@ -114,5 +113,5 @@ def _fattened(inverse: NDArray[np.float64], random: np.random.Generator) -> NDAr
     ragged = smooth_field(shape, (3.0, 3.0), random)
     chosen = np.where(ragged > 0, nearer, np.where(ragged < -1, farther, inverse))
     # A surface changes less than that over two pixels, a silhouette more.
-    silhouette: NDArray[np.float64] = np.where(np.abs(chosen - inverse) > 0.05, chosen, inverse)
+    silhouette: Floats = np.where(np.abs(chosen - inverse) > 0.05, chosen, inverse)
     return silhouette

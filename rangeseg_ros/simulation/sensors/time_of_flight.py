@@ -32,6 +32,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.simulation.fields import smooth_field
 from rangeseg_ros.simulation.sensors.sensor import Sensor, inverse_depth, millimetres, slopes
@@ -52,7 +53,7 @@ class TimeOfFlight(Sensor):
     camera = Camera(240, 180, 179.0, 179.0, 119.5, 89.5)
 
     def measure(
-        self, depth: NDArray[np.float64], camera: Camera, random: np.random.Generator
+        self, depth: Floats, camera: Camera, random: np.random.Generator
     ) -> NDArray[np.uint16]:
         ray = np.linalg.norm(camera.rays.astype(np.float64), axis=-1)
         inverse = inverse_depth(depth)
@@ -81,6 +82,6 @@ class TimeOfFlight(Sensor):
         return millimetres(measured / ray, ~dim & np.isfinite(depth) & (measured > 0.1))
 
 
-def _blurred(image: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
+def _blurred(image: Floats, sigma: float) -> Floats:
     blurred = cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(blurred, np.float64)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.arrays import Floats, Mask, Singles
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.simulation.sensors.sensor import Sensor
@@ -26,11 +27,11 @@ class TerrainFrame(NamedTuple):
     ground; `crossing` the depth at which the ray crosses the ground continued, inf for none.
     """
 
-    depth: NDArray[np.uint16] | NDArray[np.float32]
+    depth: NDArray[np.uint16] | Singles
     terrain: NDArray[np.uint8]
-    height: NDArray[np.float32]
-    size: NDArray[np.float32]
-    crossing: NDArray[np.float32]
+    height: Singles
+    size: Singles
+    crossing: Singles
 
 
 def simulate_terrain(
@@ -78,12 +79,8 @@ def simulate_terrain(
 
 
 def _with_relief(
-    measured: NDArray[np.uint16] | NDArray[np.float32],
-    relief: float,
-    ground: NDArray[np.bool_],
-    rays: NDArray[np.float64],
-    seed: int,
-) -> NDArray[np.uint16] | NDArray[np.float32]:
+    measured: NDArray[np.uint16] | Singles, relief: float, ground: Mask, rays: Floats, seed: int
+) -> NDArray[np.uint16] | Singles:
     """Depth of rough ground: each pixel sees a stone or a blade of grass, `relief` (sd, m)."""
     off = relief * np.random.default_rng([seed, 14]).standard_normal(measured.shape)
     off *= (1000 if measured.dtype == np.uint16 else 1) / np.minimum(rays[..., 2], -0.1)
@@ -91,9 +88,7 @@ def _with_relief(
     return np.where(ground & (measured > 0), rough.astype(measured.dtype), measured)
 
 
-def _on_waves(
-    scene: Terrain, rays: NDArray[np.float64], depth: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _on_waves(scene: Terrain, rays: Floats, depth: Floats) -> Floats:
     """Depth of rays that meet the ground at `depth` without the waves."""
     origin = scene.pose.position
     flat = (origin + depth[:, None] * rays)[:, 2]
@@ -103,7 +98,7 @@ def _on_waves(
     return depth
 
 
-def _ground_below(scene: Terrain, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _ground_below(scene: Terrain, points: Floats) -> Floats:
     """Height of the ground continued, without waves, at the places of points (H, W, 3)."""
     above = points.copy()
     above[..., 2] = 20.0

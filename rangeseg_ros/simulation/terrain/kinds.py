@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE
 from rangeseg_ros.simulation.solids import box
 from rangeseg_ros.simulation.terrain.scene import ALL, FAR, WIDE, Site, Terrain, Wave, slab
@@ -306,11 +306,11 @@ def terrain_scene(kind: str, seed: int) -> Terrain:
     return site.terrain()
 
 
-def stated(scene: Terrain, seed: int) -> tuple[NDArray[np.float64], float]:
+def stated(scene: Terrain, seed: int) -> tuple[Floats, float]:
     """Up and the sensor's height as a robot knows them: off by the errors of the scene."""
     random = np.random.default_rng([seed, 13])
     signs = random.choice([-1.0, 1.0], 4)
     wrong = Rotation.from_euler('xyz', scene.errors[0] * signs[:3], degrees=True)
-    up: NDArray[np.float64] = wrong.apply(scene.up)
+    up: Floats = wrong.apply(scene.up)
     height = scene.pose.position[2] - scene.wave_height(np.zeros(3))
     return up, float(height + scene.errors[1] * signs[3])

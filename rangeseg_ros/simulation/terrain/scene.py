@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.solids import Solid, about_z, box, cylinder, prism
@@ -65,11 +65,11 @@ class Terrain:
     relief: float = 0.0
 
     @property
-    def up(self) -> NDArray[np.float64]:
+    def up(self) -> Floats:
         """Up in the optical frame."""
         return self.pose.rotation[2]
 
-    def wave_height(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def wave_height(self, points: Floats) -> Floats:
         """(...) height of the waves at points (..., 3)."""
         height = np.zeros(points.shape[:-1])
         for wave in self.waves:
