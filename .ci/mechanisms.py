@@ -61,8 +61,8 @@ def _sensor(**fields: Callable[[Any, Any], float]) -> dict[str, Any]:
     """The measured sensor with fields that follow from it and from the stated one."""
 
     def changed(original: Any) -> Any:
-        def measured(image: Any, blocks: Any, stated: Any, quanta: Any) -> Any:
-            found = original(image, blocks, stated, quanta)
+        def measured(scales: Any, stated: Any, quanta: Any) -> Any:
+            found = original(scales, stated, quanta)
             return found._replace(**{name: new(found, stated) for name, new in fields.items()})
 
         return measured
@@ -154,7 +154,7 @@ MECHANISMS = (
               {'work_budget': 0.9}),
     Mechanism('bins, not pixels', 'sensing/binning.py',
               {'segmenter.bin_side': _returning(1)}),
-    Mechanism('bins of one surface', 'sensing/binning.py:of_one_surface',
+    Mechanism('bins of one surface', 'sensing/binning.py:of_one_surface,_average_near_median',
               {'sensing.binning.Bins.of_one_surface': lambda _: lambda bins, steps: bins.means}),
     Mechanism('borders of pixels, not of bins', 'by_planes/borders.py',
               {'segmenter.with_sharp_borders': lambda _: lambda regions, surfaces, models, image,
@@ -162,11 +162,11 @@ MECHANISMS = (
                    : image.shape[0], : image.shape[1]] * image.valid}),
     Mechanism('curved regions told', 'by_planes/posterior.py', {'plane_probability': 0.0}),
     Mechanism('small blocks tell the bends of planes', 'by_planes/posterior.py:_probability',
-              {'by_planes.method.plane_probabilities':
+              {'segmenter.plane_probabilities':
                lambda original: lambda fits, *rest: original(
                    fits._replace(sensor=fits.sensor._replace(unbent=1.0)), *rest)}),
     Mechanism('facets of curved surfaces told', 'by_planes/posterior.py:_evidence,_solution',
-              {'by_planes.method.plane_probabilities': _given(1, np.zeros((0, 2), np.uint16))}),
+              {'segmenter.plane_probabilities': _given(1, np.zeros((0, 2), np.uint16))}),
     Mechanism('method normals', ' '.join(f'by_normals/{name}.py' for name in _NORMALS),
               {'method': 'normals'}, option=True),
     # Planes.

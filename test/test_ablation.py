@@ -38,8 +38,7 @@ def test_without_any_plane_all_of_the_accuracy_is_lost_and_without_a_change_none
     planes = ablate.Mechanism('planes', '', {'min_pixels': 10**8})
     option = ablate.Mechanism('no planes', '', {'min_pixels': 10**8}, option=True)
     gains = ablate.measure(iter([('kinect', frame.run)]), [nothing, planes, option])
-    result = Segmenter().segment(frame.image)
-    iou = frame.truth._replace(min_pixels=300).compare(result.labels)
+    iou = frame.truth._replace(min_pixels=300).compare(Segmenter().segment(frame.image).labels)
     iou = iou.best_iou[iou.truth_sizes >= 300].mean()
     assert iou > 0.9
     assert gains['']['simulated']['kinect'] == [pytest.approx(iou, abs=0.02)]

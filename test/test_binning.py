@@ -49,19 +49,25 @@ def test_bins_are_means_of_what_was_measured(shape, side, cloud):
     image = RangeImage(rays, inverse) if cloud else RangeImage(camera.rays, inverse, camera)
     bins = Bins.of(image, side)
     assert bins.means.shape == tuple(-(-length // side) for length in shape)
+    # Of a surface that no slope bends.
+    steps = np.full([-(-length // 4) for length in bins.means.shape], 0.02, np.float32)
+    single = bins._replace(area=0.0).of_one_surface(steps)
     for i, j in np.ndindex(bins.means.shape):
         part = np.s_[side * i : side * (i + 1), side * j : side * (j + 1)]
         known = inverse[part][inverse[part] > 0]
         assert bins.means.inverse[i, j] == pytest.approx(known.mean() if len(known) else 0)
         assert bins.spread[i, j] == pytest.approx(np.ptp(known) if len(known) else 0)
+        near = np.abs(known - np.sort(known)[len(known) // 2]) <= 0.02 if len(known) else []
+        assert single.inverse[i, j] == pytest.approx(known[near].mean() if len(known) else 0)
         # Those of a camera are of the middle of all pixels, were they in the image.
         if not cloud:
             middle = (np.array([j, i]) + 0.5) * side - 0.5
             expected = [*(middle - 3) / 50, 1]
             np.testing.assert_allclose(bins.means.rays[i, j], expected, atol=1e-6)
         elif len(known):
-            mean = rays[part][inverse[part] > 0].mean(axis=0)
-            np.testing.assert_allclose(bins.means.rays[i, j], mean, rtol=1e-5)
+            own = rays[part][inverse[part] > 0]
+            np.testing.assert_allclose(bins.means.rays[i, j], own.mean(axis=0), rtol=1e-5)
+            np.testing.assert_allclose(single.rays[i, j], own[near].mean(axis=0), rtol=1e-5)
 
 
 def test_a_jump_mixes_no_two_surfaces():
@@ -134,8 +140,7 @@ def test_pixels_beside_borders_take_the_label_of_the_lowest_cost(side):
     blocks = -(-bins[0] // NODE), -(-bins[1] // NODE)
     values = draw.normal(0, 0.05, (4, *blocks)).astype(np.float32)
     box, start = np.tile([0, 0, *blocks], (4, 1)), np.arange(4) * blocks[0] * blocks[1]
-    shifts = Shifts(box, start, values.ravel())
-    models = Models(theta, np.array([0, 0.5, 0.4, 0.3]), shifts)
+    models = Models(theta, np.array([0, 0.5, 0.4, 0.3]), Shifts(box, start, values.ravel()))
     truth = draw.integers(1, 4, camera.shape)
     inverse = (theta[truth] * camera.rays).sum(axis=2) + draw.normal(0, 0.01, camera.shape)
     inverse[draw.random(camera.shape) < 0.1] = 0

@@ -61,6 +61,17 @@ def test_blocks_are_sums_over_their_pixels(shape, size):
     np.testing.assert_allclose(whole.moments, sums, rtol=1e-12)
 
 
+@pytest.mark.parametrize('size', [2, 4])
+def test_blocks_of_an_image_that_changes_are_those_of_the_new_one(size):
+    before, rays, _ = grid(41, 62)
+    after = before * np.where(np.random.default_rng(size).random(before.shape) < 0.02, 1.1, 1)
+    after[5:9, 7:20] = 0
+    before, after = RangeImage(rays, before), RangeImage(rays, after.astype(np.float32))
+    found = Blocks.of(before, size).updated(before, after, size)
+    for own, new in zip(found, Blocks.of(after, size), strict=True):
+        np.testing.assert_array_equal(own, new)
+
+
 def test_blocks_that_jumps_cross_or_that_lack_two_measurements_are_left_out():
     """Only those: an edge on the border of two blocks, or beside a hole, crosses neither."""
     inverse, rays, edges = grid(6, 10)

@@ -29,8 +29,7 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
 
-# Nothing but the folder given may be written to, neither by us nor by numba, which both try with
-# a temporary file.
+# Nothing but the folder given may be written to; numba and we try that with a temporary file.
 RESTRICT = """
 import sys, tempfile
 allowed, real = sys.argv.pop(), tempfile.TemporaryFile

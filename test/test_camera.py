@@ -156,8 +156,7 @@ def test_derivatives_of_a_lens_are_its_differences(model, d):
 def test_planes_behind_a_lens(model, d, method):
     camera, normal, distance = lens(model, *d), np.array([0.3, -0.5, -0.8]), 2.0
     normal /= np.linalg.norm(normal)
-    depth = -distance / (camera.rays.astype(np.float64) @ normal)
-    image = RangeImage.from_depth(depth, camera)
+    image = RangeImage.from_depth(-distance / (camera.rays.astype(np.float64) @ normal), camera)
     (plane,) = Segmenter(Config(method=method)).segment(image).planes
     assert plane.normal @ normal > 1 - 1e-8
     assert plane.distance == pytest.approx(distance, abs=1e-4)

@@ -180,6 +180,5 @@ def test_wrong_files_end_the_command_in_one_line(tmp_path, option, kind, segment
     code, _, error = segment_image(robot_on_a_floor(), VIEW, **{option: str(path)})
     assert code == 2 and str(path) in error and error.count('\n') == 1
     # Of the size nothing is known before there is an image.
-    told = f'{tmp_path / "params.yaml"}: parameter {option}: '
-    assert (told in error) == (kind != 'size')
+    assert (f'{tmp_path / "params.yaml"}: parameter {option}: ' in error) == (kind != 'size')
     assert not (tmp_path / 'out').exists()

@@ -152,8 +152,7 @@ def test_shadow_lies_left_of_the_occluder_and_is_as_wide_as_parallax(noise):
     left = np.argmax(frame.labels[240] == frame.labels[240, 320])
     np.testing.assert_array_equal(hole, np.arange(left - len(hole), left))
     # Real sensors leave three quarters of it blank.
-    share = 0.75 if noise == 'measured' else 1.0
-    width = share * 585 * KINECT_BASELINE * (1 / near - 1 / far)
+    width = (0.75 if noise == 'measured' else 1.0) * 585 * KINECT_BASELINE * (1 / near - 1 / far)
     # Pixels less than a half behind what is before them are one surface at a grazing angle.
     assert abs(len(hole) + 0.5 - width) <= 1
     assert (frame.labels[240, hole] == 0).all()

@@ -155,8 +155,7 @@ def as_matrix(contacts, values):
 def test_contacts_stay_those_of_the_grid(seed):
     rng = np.random.default_rng(seed)
     shape, count = (14, 17), 25
-    coarse = rng.integers(0, count, (7, 9), np.int32)
-    part = coarse.repeat(2, 0).repeat(2, 1)[:, : shape[1]]
+    part = rng.integers(0, count, (7, 9), np.int32).repeat(2, 0).repeat(2, 1)[:, : shape[1]]
     right = rng.random((shape[0], shape[1] - 1)) < 0.8
     below = rng.random((shape[0] - 1, shape[1])) < 0.8
     contacts = find_contacts(part, right, below, count)

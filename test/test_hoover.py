@@ -66,8 +66,7 @@ def literal(truth, labels, tolerance):
 def test_classes_are_those_of_the_literal_counting(runs, tolerance):
     truth, labels = images(*runs)
     result = classify(Overlap.between(truth, labels), tolerance)
-    found = [result.truth.tolist(), result.labels.tolist()]
-    assert found == literal(truth, labels, tolerance)
+    assert [result.truth.tolist(), result.labels.tolist()] == literal(truth, labels, tolerance)
 
 
 def test_overlap_figures_by_hand():
@@ -95,8 +94,7 @@ def test_figures_are_of_the_best_assignment_and_pooled_over_images():
 def test_angle_errors_of_correct_pairs():
     normals = {5: (0, 0, -1), 6: (0, -1, 0), 7: (0, np.sin(0.1), np.cos(0.1))}
     matches = {10: 5, 11: 6, 12: 7}
-    # 5-6 is 90 degrees; 5-7 is 0.1 rad; 13 has no match. 174 degrees and 6 degrees are one angle
-    # between planes.
+    # 5-6 is 90 degrees, 5-7 0.1 rad; 13 has no match. Between planes, 174 degrees are 6.
     angles, off = [(10, 11, 88.0), (10, 12, 0.0), (11, 13, 45.0), (10, 12, 174.0)], np.degrees(0.1)
     assert angle_errors(angles, normals, matches) == pytest.approx([2.0, off, 6 - off])
     assert angle_errors([], normals, matches).shape == (0,)

@@ -124,8 +124,7 @@ def test_cells_of_a_grid_are_where_its_axes_say(frame):
     points = grid_points_message(make_rosbags, header(), grid).data.view('<f4').reshape(-1, 6)
     expected = [[9.75, 20.25], [9.25, 20.25], [9.25, 20.75], [8.75, 20.25]]
     np.testing.assert_allclose(points[:, :2], expected)
-    known = [0.3, 0.4, 0.2, 0.2] if frame else [0.2] * 4
-    np.testing.assert_allclose(points[:, 2], known)
+    np.testing.assert_allclose(points[:, 2], [0.3, 0.4, 0.2, 0.2] if frame else [0.2] * 4)
     np.testing.assert_array_equal(points[:, [3, 5]], others[:, classes != UNKNOWN].T)
     assert points[:, 4].view('<u4').tolist() == [GROUND, OBSTACLE, DROP, GROUND]
 

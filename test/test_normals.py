@@ -60,8 +60,7 @@ def test_undefined_at_the_border_and_beside_shadow_and_nowhere_else(method, reac
 
 
 def test_thesis_form_is_the_cross_product_of_the_four_neighbours():
-    depth = np.random.default_rng(0).uniform(1, 2, CAMERA.shape)
-    image = RangeImage.from_depth(depth, CAMERA)
+    image = RangeImage.from_depth(np.random.default_rng(0).uniform(1, 2, CAMERA.shape), CAMERA)
     p = image.points.astype(float)
     y, x = 11, 17
     expected = np.cross(p[y, x + 1] - p[y, x - 1], p[y + 1, x] - p[y - 1, x])

@@ -54,8 +54,7 @@ def followed(scene, frames, seed=0):
     for k in frames:
         seen = *planes_of(scene, k, seed), 10**9 + k * 10**9 // 30
         motions.append(odometry.add(*seen, truths[0].rotation[2]))
-    level = motions[0].pose.after(truths[0].inverse())
-    return motions, [level.after(truths[k]) for k in frames]
+    return motions, [motions[0].pose.after(truths[0].inverse()).after(truths[k]) for k in frames]
 
 
 def errors_of(motion, truth):

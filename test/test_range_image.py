@@ -93,8 +93,7 @@ def test_the_cloud_of_a_pinhole_camera_is_its_depth_image(camera, holes):
     missing = {'none': u < 0, 'random': few, 'columns': u % 2 == 0, 'left': u < camera.width // 3}
     z[missing[holes]] = np.nan
     x = (u - f(camera.cx)) * z * f(1 / camera.fx)
-    y = (v - f(camera.cy)) * z * f(1 / camera.fy)
-    points = np.stack([x, y, z], axis=2)
+    points = np.stack([x, (v - f(camera.cy)) * z * f(1 / camera.fy), z], axis=2)
     image = RangeImage.from_points(points)
     found, expected = image.camera, RangeImage.from_depth(z, camera)
     assert found.shape == camera.shape and image.pinhole

@@ -116,8 +116,7 @@ def test_perceptron_points_are_the_published_ones():
     dy = dz * np.tan(np.pi / 4 + beta / 2)
     dx = (h2 + dy) * np.tan(alpha)
     r1 = (dz - h2) / delta
-    r2 = np.sqrt(dx**2 + (h2 + dy) ** 2) / delta
-    r3 = (values[R, C] + r0 - (r1 + r2)) * delta
+    r3 = (values[R, C] + r0 - r1) * delta - np.sqrt(dx**2 + (h2 + dy) ** 2)
     x = dx + r3 * np.sin(alpha)
     y = dy + r3 * np.cos(alpha) * np.sin(beta)
     z = dz + r3 * np.cos(alpha) * np.cos(beta)

@@ -133,8 +133,7 @@ def test_noise_free_patches_are_found_to_the_pixel():
     """Rectangles about as large as the smallest plane, with holes."""
     random = np.random.default_rng(3)
     rows = np.searchsorted((19, 43), np.arange(75), side='right')
-    columns = np.searchsorted((25, 42, 71), np.arange(101), side='right')
-    label = 4 * rows[:, None] + columns
+    label = 4 * rows[:, None] + np.searchsorted((25, 42, 71), np.arange(101), side='right')
     normals = DIRECTIONS[random.permutation(len(DIRECTIONS))[:12]][label]
     normals[random.random(label.shape) < 0.05] = np.nan
     arguments = normals, DIRECTIONS, connected(*label.shape), 40.0

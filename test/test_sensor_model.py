@@ -8,7 +8,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.fitting.error_law import Law, Strata, fit_law
-from rangeseg_ros.core.fitting.noise import ROUGH, _random, measured_sensor, quantisation
+from rangeseg_ros.core.fitting.noise import ROUGH, _random, measured_sensor, nested, quantisation
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.moments import COUNT, SIZE
@@ -34,7 +34,7 @@ def three_planes():
 
 def sensor_of(inverse):
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
-    return measured_sensor(image, Blocks.of(image), STATED, quantisation(image.inverse))
+    return measured_sensor(nested(image), STATED, quantisation(image.inverse))
 
 
 def test_variance_is_the_sum_of_both_kinds():
@@ -145,8 +145,7 @@ def test_waves_of_the_range_are_distortion_however_far_a_surface_is(waves, far):
 
 
 def test_strata_are_ranges_of_equal_size_and_slopes_in_them():
-    draw = np.random.default_rng(6)
-    squared, slope = draw.integers(0, 50, (2, 30, 40)).astype(float)
+    squared, slope = np.random.default_rng(6).integers(0, 50, (2, 30, 40)).astype(float)
     blocks = Blocks(slope, squared, slope, slope)
     strata = Strata.of(blocks, np.arange(3, 1200))
     assert strata.blocks.shape == (24, 49) and len(np.unique(strata.blocks)) == strata.blocks.size
@@ -181,7 +180,7 @@ def test_what_bends_by_more_than_the_prior_allows_is_more_than_one_surface(bend,
     noise = np.random.default_rng(0).normal(0, 1e-4, CAMERA.shape)
     inverse = 0.5 + 3e-4 * bend * (row + row[:480, None]) + noise
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
-    sensor = measured_sensor(image, Blocks.of(image), STATED._replace(distortion=3e-4), (0, 0))
+    sensor = measured_sensor(nested(image), STATED._replace(distortion=3e-4), (0, 0))
     found = np.hypot(sensor.distortion, sensor.range_distortion)
     assert found == pytest.approx(3e-4 * bend * width**2 / 5, rel=0.1)
     assert sensor.unbent == pytest.approx(unbent, rel=0.1)
@@ -214,10 +213,10 @@ def test_whatever_the_image_the_model_is_finite(seed, holes, scale):
     inverse[random.random(inverse.shape) < holes] = 0
     camera = Camera(80, 60, 70.0, 70.0, 39.5, 29.5)
     image = RangeImage(camera.rays, inverse.astype(np.float32), camera)
-    blocks = Blocks.of(image)
-    sensor = measured_sensor(image, blocks, STATED, (0.0, 0.0))
+    scales = nested(image)
+    sensor = measured_sensor(scales, STATED, (0.0, 0.0))
     assert np.isfinite(sensor).all() and min(sensor) >= 0 and sensor.white <= 1
-    steps = jump_steps(blocks, sensor)
+    steps = jump_steps(scales[0], sensor)
     assert np.isfinite(steps).all()
     assert ((steps.windows > 0) & (steps.windows <= steps.pixels)).all()
 
@@ -280,8 +279,7 @@ def test_a_patch_is_what_the_mean_of_four_pixels_keeps_of_the_noise(white, width
 
 
 def test_what_is_said_of_the_errors():
-    width = 9 / (2 * np.sqrt(np.pi))
-    stereo = SensorModel(0.0034, 0.0, 0.1, width, 0.005, 0.0, 35.0)
+    stereo = SensorModel(0.0034, 0.0, 0.1, 9 / (2 * np.sqrt(np.pi)), 0.005, 0.0, 35.0)
     assert str(stereo) == 'noise 0.0034 1/m, correlated over 9 px, distortion 0.005 1/m'
     assert str(stereo._replace(quantum=0.001)) == f'{stereo}, steps of 0.001 1/m'
     laser = SensorModel(0.0, 0.012, 1.0, 0.0, 0.0, 0.0, 35.0, range_quantum=0.001)

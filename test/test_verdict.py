@@ -274,8 +274,7 @@ def test_only_pictures_begin_at_an_unknown_distance(seen):
 @pytest.mark.parametrize('kind', SIGNS)
 def test_decoded_images_are_depths_but_for_a_factor(seen, kind):
     known = seen.depth[seen.depth > 0]
-    q = 1 - (known.min() / known.max()) ** SIGNS[kind]
-    again = decoded(pictured(seen, kind), q).inverse
+    again = decoded(pictured(seen, kind), 1 - (known.min() / known.max()) ** SIGNS[kind]).inverse
     # The end that is black is no measurement.
     shown = again > 0
     assert (shown == (seen.depth > 0)).mean() > 0.999

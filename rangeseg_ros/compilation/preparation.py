@@ -40,8 +40,7 @@ _WIDTH = 30
 # Of frames that have all that is compiled run, see `rehearse`. Exact ones take minutes if large:
 # the least that takes the path of large frames.
 _SIZE, _EXACT_SIZE = 10, 5
-# Metres at a metre. The second frame finds the planes of the first, the third has many that do not
-# last.
+# Metres at a metre. The second frame finds the planes of the first; many of the third are new.
 _NOISE = (0.001, 0.001, 0.03)
 _HEADER = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id='')
 

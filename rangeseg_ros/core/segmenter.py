@@ -16,7 +16,7 @@ from rangeseg_ros.core.by_planes.surfaces import unite_regions
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane, describe_regions
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.fitting.noise import measured_sensor, quantisation
+from rangeseg_ros.core.fitting.noise import measured_sensor, nested, quantisation
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.options import ConfigError
@@ -34,8 +34,8 @@ from rangeseg_ros.core.sensing.jump_edges import jump_edges
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
-# What is begun of an image: its bins, and blocks of these.
-Begun = Task[tuple[Bins, Blocks]]
+# What is begun of an image: its bins, and nested blocks of these.
+Begun = Task[tuple[Bins, list[Blocks]]]
 
 
 class Stopwatch:
@@ -129,8 +129,8 @@ class Segmenter:
         side = self._side(image)
         if config.dithering > 0:
             image, begun = image.dithered(config.dithering, config.seed), None
-        bins, blocks = begun.result() if begun else _binned(image, side)
-        view, sensor, jumps = _preprocessed(image, config, bins, blocks, watch)
+        begun = begun or Task(_binned, image, side)
+        view, sensor, jumps = _preprocessed(image, config, begun, watch)
         labelling: by_planes.Labelling | by_normals.Labelling
         if config.method == 'planes':
             labelling = by_planes.segment(view, config, watch.lap)
@@ -152,13 +152,15 @@ class Segmenter:
         # Of directions, all regions are planes.
         flat = (probability >= config.plane_probability) | (config.method == 'normals')
         flat[0] = True
-        numbers, curved = numbers_of(flat), relabel(regions, numbers_of(~flat))
+        numbers = numbers_of(flat)
+        curved = None if config.method == 'normals' else relabel(regions, numbers_of(~flat))
         fits = fits.without(~flat)
         watch.lap('regions')
         # Bridged pixels were not measured; some regions have no plane, or one without an end.
         names = (fits.farthest() > 0)[numbers] * numbers
         found = Task(lambda: relabel(pixels.result() if pixels else regions * image.valid, names))
-        described = fits, roots.result()[flat], sensor if pixels else errors, probability[flat]
+        errors = sensor if pixels else errors
+        described = fits, lambda: roots.result()[flat], errors, probability[flat]
         planes = describe_regions(relabel(regions, numbers), view.whole, *described)
         labels = found.result()
         result = Segmentation(
@@ -181,41 +183,39 @@ class Segmenter:
         return result
 
 
-def _binned(image: RangeImage, side: int) -> tuple[Bins, Blocks]:
-    """Bins of an image, and blocks of these."""
+def _binned(image: RangeImage, side: int) -> tuple[Bins, list[Blocks]]:
+    """Bins of an image, and nested blocks of these."""
     bins = Bins.of(image, side)
-    return bins, Blocks.of(bins.means)
+    return bins, nested(bins.means)
 
 
 def _preprocessed(
-    image: RangeImage, config: Config, bins: Bins, blocks: Blocks, watch: Stopwatch
+    image: RangeImage, config: Config, begun: Begun, watch: Stopwatch
 ) -> tuple[View, SensorModel, GridEdges | None]:
     """What is known of an image's bins before planes are looked for.
 
     And the errors of its pixels, and the jump edges between bins.
     """
-    side, planes = bins.side, config.method == 'planes'
-    nodes = Task(Blocks.of, bins.means, NODE) if planes else None
+    measured, planes = config.sensor_model == 'measured', config.method == 'planes'
+    quanta = quantisation(image.inverse) if measured else (0.0, 0.0)
+    bins, scales = begun.result()
+    side, nodes = bins.side, Task(Blocks.of, bins.means, NODE) if planes else None
     least = -(-least_pixels(config.min_pixels, image.shape) // side**2)
     stated = SensorModel.from_config(config, image.shape).binned(side)
-    sensor = stated
-    if config.sensor_model == 'measured':
-        sensor = measured_sensor(bins.means, blocks, stated, quantisation(image.inverse))
-    identified = config.sensor_model != 'measured' or sensor is not stated
+    sensor = measured_sensor(scales, stated, quanta) if measured else stated
+    identified = not measured or sensor is not stated
     watch.lap('noise')
     # Method normals tells parallel surfaces apart by jump edges alone, so that one too many on
     # a surface seen at a grazing angle costs it less than one too few.
-    grazing = sensor
-    if not planes:
-        grazing = sensor._replace(direction_noise=0.0)
-    steps = jump_steps(blocks, grazing)
+    grazing = sensor if planes else sensor._replace(direction_noise=0.0)
+    steps = jump_steps(scales[0], grazing)
     if config.edge_step > 0:
         given = np.full_like(steps.windows, config.edge_step)
         steps = steps._replace(windows=given, pixels=given)
     excess = bins.noise_of_pixels(sensor)
     if side > 1:
         image = bins.of_one_surface(steps.pixels * np.float32(excess**0.5))
-    blocks = blocks.updated(bins.means, image)
+    blocks = scales[0].updated(bins.means, image)
     # Planes are fitted to what was measured; where they end is found with small holes bridged,
     # which bins of several pixels do not have.
     whole = bridge_holes(image, steps.windows, steps.slopes) if side == 1 else image

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
@@ -174,13 +175,13 @@ def describe_regions(
     labels: Labels,
     image: RangeImage,
     fits: Fits,
-    root: Floats,
+    roots: Callable[[], Floats],
     sensor: SensorModel,
     probability: Floats | None = None,
 ) -> list[Plane]:
     """Planes of the regions 1...M of `labels` (H, W), but of those whose pixels determine none.
 
-    `root` (M + 1, 3, 3) is `fits.roots()`, `probability` (M + 1,) that of the regions to be
+    `roots` give those of `fits`, asked for late, `probability` (M + 1,) that of the regions to be
     planes, 1 where it is not given. `sensor` is that of the pixels, of which those of the image
     may be means.
     """
@@ -189,6 +190,7 @@ def describe_regions(
     if not theta.any():
         return []
     normal, distance, centroid, rms, confidence = _described(fits, sensor)
+    root = roots()
     covariance = squares(plane_jacobians(normal, distance) @ root)
     if image.place.any():
         # From the sensor to the frame of the points.

@@ -8,6 +8,7 @@ distortion make of them is in docs/method.md.
 from __future__ import annotations
 
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -55,16 +56,25 @@ _COARSEST = 0.05
 _SAME = 0.05
 
 
+def nested(image: RangeImage) -> list[Blocks]:
+    """Blocks of 4, 8, 16, ... pixels of an image."""
+    scales, side = [Blocks.of(image)], BLOCK
+    while side < _WIDEST:
+        side *= 2
+        scales.append(scales[-1].merged(image.rays, side))
+    return scales
+
+
 def measured_sensor(
-    image: RangeImage, blocks: Blocks, prior: SensorModel, quanta: tuple[float, float]
+    scales: list[Blocks], prior: SensorModel, quanta: tuple[float, float]
 ) -> SensorModel:
-    """The errors that an image shows in its blocks; the `prior` as far as it says too little.
+    """The errors that an image shows in its `nested` blocks; the `prior` where it says too little.
 
     `quanta` are the steps that it is rounded to, see `quantisation`.
     """
     # Smaller blocks would not do: rounding hides in those that it rounds alike, and noise makes
     # slopes of its own.
-    coarse = blocks.merged(image.rays, 2 * BLOCK)
+    coarse = scales[1]
     count = coarse.moments[..., COUNT]
     used = np.flatnonzero(2 * count >= count.max())
     if len(used) < SAMPLES:
@@ -82,7 +92,7 @@ def measured_sensor(
     shown = quantile(mean_square.ravel()[strata.blocks], _QUANTILE)
     shown = np.maximum(shown, least.facing(strata.squared))
     noise = fit_law(strata, shown, np.zeros(len(shown)), Law(1.0, 0.0))
-    found = _over_scales(image.rays, blocks, coarse, noise, least, prior)
+    found = _over_scales(scales, noise, least, prior)
     if found is None:
         return prior
     within, between, filled, distortion, unbent = found
@@ -105,7 +115,7 @@ def measured_sensor(
 
 
 def _over_scales(
-    rays: Singles, blocks: Blocks, coarse: Blocks, noise: Law, least: Law, prior: SensorModel
+    scales: list[Blocks], noise: Law, least: Law, prior: SensorModel
 ) -> tuple[list[float], float, float, Law, float] | None:
     """What blocks of 4, 8, 16, ... pixels show, as long as there are enough of them.
 
@@ -114,7 +124,8 @@ def _over_scales(
     shows. None where too few are flat. Noise is the `least` at least; what bends by more than the
     `prior` allows is more than one surface.
     """
-    level = noise.variances(coarse).repeat(2, axis=0).repeat(2, axis=1)
+    blocks = scales[0]
+    level = noise.variances(scales[1]).repeat(2, axis=0).repeat(2, axis=1)
     level = level[: len(blocks.squared), : blocks.squared.shape[1]]
     count = blocks.moments[..., COUNT]
     # Six pixels leave three degrees of freedom.
@@ -128,8 +139,8 @@ def _over_scales(
     shown = noise.times(within[0])
     shown = shown._replace(constant=max(shown.constant, least.constant))
     between, filled, distortion, typical = 1.0, 1.0, Law(0.0, 0.0), list[float]()
-    side, larger, bend, ranges = 2 * BLOCK, coarse, noise, strata.squared
-    while side <= _WIDEST:
+    bend, ranges = noise, strata.squared
+    for blocks, larger in pairwise(scales):
         whole = sum_of_four(flat) == 4
         used = np.flatnonzero(whole)
         if len(used) < SAMPLES:
@@ -140,7 +151,7 @@ def _over_scales(
         excess = np.maximum(larger.residual - sum_of_four(blocks.residual), 0) / (9 * _MEDIAN)
         within.append(_ratio(larger, level, used, strata))
         pixels = _median(larger.moments[..., COUNT], used) / 4
-        if side == 2 * BLOCK:
+        if larger is scales[1]:
             between = float(strata.medians(excess / level).mean())
             filled = pixels / BLOCK**2
         expected = shown.variances(larger)
@@ -154,8 +165,6 @@ def _over_scales(
         # a bent one, only what happens to be flat would be left to tell the distortion.
         allowed = OUTLIER**2 * systematic_variance(prior, larger.squared) * pixels / 8
         flat = whole & (excess < _BENT * (expected + allowed))
-        side *= 2
-        blocks, larger = larger, larger.merged(rays, side)
     if not typical:
         return None
     rounding = float(quantile(least.facing(ranges), 0.5))

@@ -135,8 +135,7 @@ class Camera:
             )
 
     def __reduce__(self) -> tuple[type[Camera], tuple[Any, ...]]:
-        # Without the rays: they are large, and would come back writeable, to compiled code a type
-        # of its own.
+        # Without the large rays, which would come back writeable: to compiled code another type.
         return Camera, astuple(self)
 
     @property
