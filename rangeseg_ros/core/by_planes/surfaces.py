@@ -88,9 +88,8 @@ def unite_regions(regions: Labels, view: View, smoothness: float) -> tuple[Label
     returns the pairs (E, 2) of regions that touch.
     """
     moments = region_moments(regions, int(regions.max(initial=0)) + 1, view.whole, view.sensor)
-    touching = view.grid.right > 0, view.grid.below > 0
     expected = Expected.of(view, 1, smoothness)
-    roots, pairs = _agglomerate(regions.astype(np.int32), *touching, moments, expected)
+    roots, pairs = _agglomerate(regions.astype(np.int32), *view.grid, moments, expected)
     pixels = np.bincount(roots, moments[:, COUNT], len(moments)).astype(np.intp)
     numbers = by_falling_size(pixels)[roots]
     return relabel(regions, numbers), numbers[pairs]

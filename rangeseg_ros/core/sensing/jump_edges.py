@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.arrays import Mask, Singles
+from rangeseg_ros.core.runtime.threads import Task
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.grid import GridEdges
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -51,12 +52,13 @@ def plane_deviation(
     step, lone, clear = (
         _along_rows(a, image.shape) for a in (step, np.maximum(step, between), clear)
     )
+    wide = Task(_window_sums, image, 2 * _WINDOW + 1)
     total, count = _window_sums(image, _WINDOW)
     means = _framed(total / np.maximum(count, 1))
     jumps = np.empty((height, width - 1), np.bool_), np.empty((height - 1, width), np.bool_)
     for down, result in enumerate(jumps):
         _find_deviations(means, step, bool(down), result)
-    total, count = _window_sums(image, 2 * _WINDOW + 1)
+    total, count = wide.result()
     nearer = image.inverse * count > total
     # 1 for candidates below the mean, 2 for those above.
     sides = pixels_beside(jumps).view(np.uint8) << nearer
