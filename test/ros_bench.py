@@ -236,10 +236,7 @@ class Bench(AbstractContextManager):
         self.until(lambda: time.monotonic() > end)
 
     def until(self, condition):
-        """Spin until the condition holds; its value.
-
-        For nearly as long as a test may take: a loaded machine compiles the kernels for minutes.
-        """
+        """Spin until the condition holds; its value. A loaded machine compiles for minutes."""
         end = time.monotonic() + 500
         while not (value := condition()):
             assert self.process.poll() is None, f'the node has ended: {self.complaints()}'

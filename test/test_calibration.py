@@ -41,10 +41,7 @@ def true_map(scale=0.002):
 
 
 def frames(count, error, seed=0, noise=NOISE, rows=60, wrong=0):
-    """Two slanted planes side by side in each frame, at depths that change: labels and image.
-
-    The upper rows have labels, which of some frames, each so many, take both planes for one.
-    """
+    """Images of two slanted planes, labels of upper rows; each `wrong`-th takes both for one."""
     random = np.random.default_rng(seed)
     for k in range(count):
         labels = np.ones(CAMERA.shape, np.uint16)

@@ -206,8 +206,7 @@ SHARES = pytest.approx((4 / 5 + 2 / 3) / 2), pytest.approx(6 / 7)
 NONE = 65535
 # Truth 1: 4 pixels, all in found 5 (5 pixels): (1, 0.8). Truth 2: 3 pixels, 2 in found 6.
 TWO = [1, 1, 1, 1, 2, 2, 2, 0], [5, 5, 5, 5, 5, 6, 6, 0]
-# Found 7 has four pixels, of which one is not judged and one judged curved: 2 / 3. Without 65535
-# in the truth every pixel counts: 2 / 4.
+# Of the four pixels of 7 one is not judged, one curved: 2 / 3. Without 65535 all count: 2 / 4.
 CURVED, FLAT, WIDE = [1, 1, 0, NONE, NONE], [1, 1, 0, 0, 0], [7, 7, 7, 7, 0]
 # Found 8 has 2 of its 6 pixels on truth 1, the rest is not judged; 7 has the other 8.
 RIM, PARTS = [1] * 10 + [0] * 4 + [NONE], [7] * 8 + [8] * 6 + [0]

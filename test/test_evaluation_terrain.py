@@ -75,10 +75,7 @@ def drawn(tmp_path):
 
 
 def test_shares_and_pictures_are_those_counted_on_paper(drawn, figures_of, tmp_path):
-    """Beside borders of classes 3 pixels do not count, nor what is beyond a sensor's reach.
-
-    That is told by its own distance, for a drop by that of the ground in its place.
-    """
+    """But beside borders and beyond a sensor's reach, of a drop by the ground in its place."""
     code, figures, out, _ = figures_of(*EVALUATE, drawn, '--output', tmp_path / 'pictures')
     assert code == 0 and figures['images'] == 2
     assert figures['by_kind'] == {'far': pytest.approx(REALSENSE), 'near': pytest.approx(KINECT)}

@@ -101,10 +101,7 @@ def test_distortion_that_the_sensor_has_does_not_split_a_wall(strength, stated):
     ('power', 'share', 'planes'), [(2, 0.004, 1), (2, 0.03, 0), (1, 0.005, 2)]
 )
 def test_planes_bend_by_a_share_of_their_width(power, share, planes):
-    """To a sensor without distortion: a table bends by parts of a thousand, a barrel by more.
-
-    None bends all in one place, as at a crease.
-    """
+    """A table bends by parts of a thousand, a barrel by more: nowhere as at a crease."""
     across = np.abs(CAMERA.rays[..., 0]) ** power
     bent = across / across.std() * share * 2 * np.ptp(CAMERA.rays[..., 0])  # at 2 m
     labels, moments = grown(1 / (2 + bent), noise=NOISE / 4, distortion=0.0, noise_correlation=0.0)

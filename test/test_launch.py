@@ -36,10 +36,7 @@ def test_rviz_shows_topics_of_the_node_by_displays_of_their_types():
 
 @pytest.fixture
 def launched(monkeypatch):
-    """Settings of the nodes that the launch file starts, by values of its arguments.
-
-    There is no wheel of launch: what the file uses of it is replaced.
-    """
+    """Settings of the nodes that the launch file starts; of launch, which has no wheel, mocks."""
     launch, launch_ros = MagicMock(), MagicMock()
     for name, module in (('launch', launch), ('launch_ros', launch_ros)):
         monkeypatch.setitem(sys.modules, name, module)

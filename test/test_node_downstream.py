@@ -131,8 +131,7 @@ def test_up_is_that_of_the_accelerometer_in_the_frame_of_the_images(bench):
             assert height(0, 0, -GRAVITY, **fields) == level
         for pushed in ((0, 0, -1.2 * GRAVITY), (np.nan, 0, 0), (0, 0, 0)):
             assert height(*pushed) == level
-        # A camera that looks down sees the floor in front of it. For a while, what was measured
-        # last is up where nothing else tells it.
+        # A camera looks down on the floor. For a while, up is as it was measured last.
         for frame in (FRAME, 'imu_link'):
             assert height(0, 0, -GRAVITY, frame) == pytest.approx(WALL, abs=6e-3)
         # Stamps before all time end nothing.

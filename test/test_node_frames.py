@@ -99,10 +99,8 @@ def tf_messages():
 
 
 def test_node_and_replay_place_the_same_planes_whatever_becomes_of_tf(tmp_path, tf_messages):
-    """At 50 Hz, out of order, late, from another publisher, and with a jump: byte for byte.
-
-    Before the other tests, whose node would listen to the same camera.
-    """
+    """At 50 Hz, out of order, late, from another publisher, and with a jump: byte for byte."""
+    # Before the other tests, whose node would listen to the same camera.
     camera, late, restart, jump = kinect_camera(160, 120), 4, 6, 7
     depth = floor_depth(camera)
     recording = Recording()
@@ -157,10 +155,7 @@ def test_node_and_replay_place_the_same_planes_whatever_becomes_of_tf(tmp_path, 
 
 
 def test_without_an_up_there_is_no_terrain(tf_messages):
-    """Before tf has come, a minute after it has stopped, and of a camera knocked over.
-
-    Nor ground where tf has the camera higher than it is.
-    """
+    """Before tf, a minute after it stopped, of a camera knocked over, or set too high."""
     topics = 'terrain', 'obstacles', 'grid'
 
     def published(bench, *robot, **where):

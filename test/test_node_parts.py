@@ -24,8 +24,7 @@ from rangeseg_ros.ros.pairing import Found, StampPairing
         'add 1 a, add 2 b, find 1 a own',
         # An image waits for its own once a pair was seen.
         'find 1, add 1 a, find 1 a own, find 2, add 2 b, find 2 b own',
-        # One whose own never comes takes the last; and those after it do not wait, until one turns
-        # out to have been too early.
+        # One whose own never comes takes the last; others do not wait, until one was too early.
         'add 1 a, find 1 a own, find 2, give up, find 2 a, find 3 a, add 3 c, find 4',
         # Sent once per session, or without a stamp.
         'add 1 a, find 5 a, find 6 a',

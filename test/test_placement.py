@@ -13,6 +13,7 @@ from scipy.stats import chi2
 from rangeseg_ros import Camera, Config, RangeImage
 from rangeseg_ros.core.mapping.map_planes import moved_planes
 from rangeseg_ros.core.mapping.mount import mount_of
+from rangeseg_ros.core.mapping.odometry import Motion
 from rangeseg_ros.core.mapping.placement import Placement, Up, UpFilter, find_placement
 from rangeseg_ros.core.mapping.transforms import Transform, TransformError
 from rangeseg_ros.core.sequence import SequenceSegmenter
@@ -120,6 +121,27 @@ def test_the_last_up_is_held_while_a_slope_can_be_told_from_level_ground():
     # Where nobody asks, the parameters hold.
     nobody = Placement()
     assert filtered.settle(nobody, 0, config) is nobody
+
+
+def test_an_up_that_is_held_turns_as_the_planes_do():
+    filtered, none, up = UpFilter(), np.zeros((6, 6)), np.array([0.0, -1, 0])
+    silent = Placement(asked=True, sources={'up': 'no tf'})
+    # Pitches by a degree from frame to frame; turns about level axes become uncertain.
+    turn = [
+        Transform(Rotation.from_rotvec([np.radians(k), 0, 0]).as_matrix(), up) for k in range(60)
+    ]
+    grows, speed = np.diag([0, 0, 0, 1e-6, 9e-2, 3e-6]), np.radians([0, 0, 0, 10, 0, 0])
+    path = [Motion('odom', t, k * grows, speed, none, 3) for k, t in enumerate(turn)]
+    filtered.settle(replace(silent, ups=[Up(up, 1.5, 'tf')]), 0, Config(), None)
+    for k, motion in enumerate(path[:-1]):
+        placed = filtered.settle(silent, (k + 1) * 10**8, Config(), motion)
+        np.testing.assert_allclose(placed.up, turn[k + 1].rotation.T @ up, atol=1e-9)
+        sd = np.hypot(1.5, np.hypot(np.degrees(np.sqrt(k * 2e-6)), 0.2))
+        assert placed.up_sd == pytest.approx(sd)
+    assert 'held by planes for 5.9 s' in placed.sources['up']
+    # An odometry that begins anew does not say where the camera was before.
+    for motion in (None, path[-1]):
+        assert filtered.settle(silent, 6 * 10**9, Config(), motion).lost
 
 
 @pytest.mark.parametrize('sd', [(1.5, 1.5), (1.5, 3.6), (4.0, 0.5)])

@@ -104,9 +104,8 @@ def test_what_moves_by_itself_does_not_move_the_camera():
         ([(*STAY, (*MIDDLE, BOX)), (*STAY, (*MIDDLE, NEARER))], [[1, 2, 3, 4], [1, 2, 3, 5]]),
         # Parts far apart are not renamed.
         ([(*STAY, LEFT, RIGHT), (*STAY, RIGHT)], [[1, 2, 3, 4, 5], [1, 2, 3, 5]]),
-        # Two bad pairs are not worth more than a sure one: on one surface everything may be
-        # everything. The large part could take the id of the scrap that is gone, and leave its
-        # own to the scrap that is new.
+        # Two bad pairs are not worth more than a sure one: the large part could take the id of the
+        # scrap that is gone, and leave its own to the scrap that is new.
         ([(wall(0, 15), wall(20, 140)), (wall(145, 160), wall(26, 140))], [[1, 2], [3, 2]]),
         # A sliver does not give its id to what swallows it.
         ([SLIVER, (*SLIVER, wall(20, 160)), (wall(0, 160), GROUND)], [[1, 2], [1, 2, 3], [3, 2]]),

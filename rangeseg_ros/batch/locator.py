@@ -6,6 +6,7 @@ from collections import Counter
 from pathlib import Path
 
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.mapping.odometry import Motion
 from rangeseg_ros.core.mapping.placement import Placement, UpFilter, find_placement
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.io.transforms import RecordedTransforms
@@ -26,13 +27,13 @@ class Locator(RecordedTransforms):
         self.last = Placement()
         self._up = UpFilter()
 
-    def place(self, frame: DepthFrame) -> Placement:
-        """Where the camera was."""
+    def place(self, frame: DepthFrame, motion: Motion | None = None) -> Placement:
+        """Where the camera was; `motion` is that up to the frame before."""
 
         def lookup(target: str, source: str) -> Transform:
             return self.lookup(target, source, frame.stamp, frame.time)
 
         found = find_placement(self._config, frame.frame_id, lookup)
         self.problems.update(f'{what} {why}' for what, why in found.missing.items())
-        self.last = self._up.settle(found, frame.stamp, self._config)
+        self.last = self._up.settle(found, frame.stamp, self._config, motion)
         return self.last

@@ -17,6 +17,7 @@ from rangeseg_ros.compilation.preparation import prepare
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.roles import Tilt
 from rangeseg_ros.core.mapping.map_planes import MapPlane
+from rangeseg_ros.core.mapping.odometry import Motion
 from rangeseg_ros.core.mapping.placement import Placement
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.segmentation import Segmentation
@@ -227,7 +228,7 @@ class _Results:
 def segment_frames(
     source: DepthBag,
     sequence: SequenceSegmenter,
-    place: Callable[[DepthFrame], Placement] = lambda frame: Placement(),
+    place: Callable[[DepthFrame, Motion | None], Placement] = lambda *_: Placement(),
     progress: Progress | None = None,
 ) -> Iterator[tuple[int, DepthFrame, RangeImage, Segmentation]]:
     """Segment the frames of a recording, with persistent ids and roles; `place` locates them.
@@ -247,7 +248,7 @@ def segment_frames(
                 source.lose(str(error))
                 continue
             image = corrected(image, sequence.config)
-            at = place(frame)
+            at = place(frame, sequence.motion)
             result = sequence.segment(image, frame.stamp, at.up, at.pose, at.height, at.up_sd)
             if at.lost:
                 result = replace(result, survey=None)

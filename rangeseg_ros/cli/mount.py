@@ -38,7 +38,7 @@ def command(ctx: click.Context, recording: Path, base: str, config: Config) -> N
     frames, name = 0, ''
     with DepthBag(recording) as source:
         for _, frame, _, _ in segment_frames(
-            source, sequence, lambda frame: still, partial(options.progress, unit='frame')
+            source, sequence, lambda *_: still, partial(options.progress, unit='frame')
         ):
             frames, name = frames + 1, frame.frame_id
     mount = mount_of(sequence.map.planes, frames, sequence.config.role_tolerance)

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.arrays import Indices, Labels, Mask
+from rangeseg_ros.core.arrays import Indices, Ints, Labels, Mask
 from rangeseg_ros.core.config import VGA
 from rangeseg_ros.core.sensing.grid import Grid
 
@@ -32,9 +32,7 @@ def plane_regions(labels: NDArray[np.integer], valid: Mask, grid: Grid, min_pixe
 
 
 @njit(cache=True, nogil=True)
-def connected_components(
-    labels: NDArray[np.integer], grid: Grid, valid: Mask
-) -> NDArray[np.int32]:
+def connected_components(labels: NDArray[np.integer], grid: Grid, valid: Mask) -> Ints:
     """4-connected components of like labels that cross no disconnected edge.
 
     Their numbers (H, W), 1...M, 0 where not valid: by two passes, with a table of equivalent

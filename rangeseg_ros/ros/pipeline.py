@@ -167,7 +167,7 @@ class Pipeline:
         elif config is not self._sequence.config:
             self._sequence.config = config
         sequence = self._sequence
-        at = self._up.settle(segmented.at, stamp, config)
+        at = self._up.settle(segmented.at, stamp, config, sequence.motion)
         placed = stamp, at.up, at.pose, at.height, at.up_sd
         found = sequence.segment(segmented.image, *placed, segmented.found)
         lost = at.lost

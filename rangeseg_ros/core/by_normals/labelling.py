@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.arrays import Mask, Singles
+from rangeseg_ros.core.arrays import Ints, Mask, Singles
 from rangeseg_ros.core.graphcut import expansion
 from rangeseg_ros.core.graphcut.expansion import (
     ROUNDING,
@@ -38,9 +38,7 @@ from rangeseg_ros.core.sensing.grid import Grid
 _SIZE = 8
 
 
-def minimise(
-    normals: Singles, directions: Singles, grid: Grid, smoothness: float
-) -> NDArray[np.int32]:
+def minimise(normals: Singles, directions: Singles, grid: Grid, smoothness: float) -> Ints:
     """Labelling (H, W) of low energy (eq. 5.3 and 5.5, lambda = `smoothness`).
 
     Labels are indices of directions (K, 3); normals (H, W, 3) are NaN where undefined.
@@ -56,15 +54,13 @@ def minimise(
     return labels
 
 
-def minimise_exactly(
-    normals: Singles, directions: Singles, grid: Grid, smoothness: float
-) -> NDArray[np.int32]:
+def minimise_exactly(normals: Singles, directions: Singles, grid: Grid, smoothness: float) -> Ints:
     """What `minimise` finds, from the nearest direction at every pixel on.
 
     No expansion of a label over the image improves it (thesis 4.8).
     """
 
-    def cost(label: int, pixels: NDArray[np.int32]) -> Singles:
+    def cost(label: int, pixels: Ints) -> Singles:
         return label_costs(label, pixels, 1, normals, directions)
 
     labels = _nearest(normals, directions, 1)
@@ -76,7 +72,7 @@ def minimise_exactly(
 
 
 @njit(cache=True, nogil=True)
-def _nearest_directions(normals: Singles, directions: Singles) -> NDArray[np.int32]:
+def _nearest_directions(normals: Singles, directions: Singles) -> Ints:
     """Direction (K, 3) nearest to each normal (h, w, 3), of any length: (h, w) index, else 0."""
     labels = np.zeros(normals.shape[:2], np.int32)
     for i in range(len(labels)):
@@ -90,7 +86,7 @@ def _nearest_directions(normals: Singles, directions: Singles) -> NDArray[np.int
     return labels
 
 
-def _nearest(normals: Singles, directions: Singles, size: int) -> NDArray[np.int32]:
+def _nearest(normals: Singles, directions: Singles, size: int) -> Ints:
     """Direction nearest to the mean of each square's normals."""
     return _nearest_directions(_per_square(np.add, np.nan_to_num(normals), size), directions)
 
@@ -129,7 +125,7 @@ def _enlarged(squares: NDArray[Any], size: int, shape: tuple[int, ...]) -> NDArr
 
 
 def _expand(
-    labels: NDArray[np.int32], size: int, links: Singles, normals: Singles, directions: Singles
+    labels: Ints, size: int, links: Singles, normals: Singles, directions: Singles
 ) -> None:
     """Expand the labels (h, w) of sites of `size` x `size` pixels; in place."""
     height, width = labels.shape
@@ -159,9 +155,7 @@ def _expand_rows(
 
 
 @njit(cache=True, nogil=True)
-def data_costs(
-    labels: NDArray[np.int32], size: int, normals: Singles, directions: Singles
-) -> Singles:
+def data_costs(labels: Ints, size: int, normals: Singles, directions: Singles) -> Singles:
     """Cost (h, w) of every site's own label, of normals (H, W, 3) and directions (K, 3)."""
     costs = np.empty(labels.shape, np.float32)
     for i in range(labels.shape[0]):

@@ -6,9 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rangeseg_ros.core.arrays import Singles
+from rangeseg_ros.core.arrays import Ints, Singles
 from rangeseg_ros.core.by_normals.directions import directions
 from rangeseg_ros.core.by_normals.labelling import data_costs, minimise, minimise_exactly
 from rangeseg_ros.core.by_normals.normals import observed_normals
@@ -22,7 +21,7 @@ from rangeseg_ros.core.sensing.range_image import RangeImage
 class Labelling:
     """Discretised normals as labels of the pixels of an image."""
 
-    labels: NDArray[np.int32]  # (H, W), indices of directions
+    labels: Ints  # (H, W), indices of directions
     directions: Singles  # (K, 3), unit vectors towards the sensor
     observed: Singles  # (H, W, 3), NaN where undefined
     grid: Grid

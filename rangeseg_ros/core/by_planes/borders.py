@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from rangeseg_ros.core.arrays import Labels, Singles
+from rangeseg_ros.core.arrays import Ints, Labels, Singles
 from rangeseg_ros.core.by_planes.plane_energy import CAP, NO_PLANE, Models
 from rangeseg_ros.core.by_planes.shifts import shift_at
 from rangeseg_ros.core.sensing.blocks import NODE
@@ -24,7 +23,7 @@ _LABELS = 4
 
 def with_sharp_borders(
     regions: Labels,
-    surfaces: NDArray[np.int32],
+    surfaces: Ints,
     models: Models,
     image: RangeImage,
     side: int,
@@ -46,7 +45,7 @@ def with_sharp_borders(
 @njit(cache=True, nogil=True)
 def _settle(
     regions: Labels,
-    surfaces: NDArray[np.int32],
+    surfaces: Ints,
     models: Models,
     inverse: Singles,
     rays: Singles,

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from rangeseg_ros.core.arrays import Floats, Singles
+from rangeseg_ros.core.arrays import Floats, Ints, Singles
 from rangeseg_ros.core.by_planes.plane_energy import (
     LEAST_GAIN,
     NO_PLANE,
@@ -27,12 +26,8 @@ _DOMAIN = 4
 
 
 def refine(
-    problem: Problem,
-    surfaces: NDArray[np.int32],
-    blocks: Floats,
-    moments: Floats,
-    sensor: SensorModel,
-) -> tuple[NDArray[np.int32], Models]:
+    problem: Problem, surfaces: Ints, blocks: Floats, moments: Floats, sensor: SensorModel
+) -> tuple[Ints, Models]:
     """Label the pixels (n,) with the planes of the surfaces (rows, columns) of blocks, or 0.
 
     Given are the moments of the blocks (rows, columns, 13) and of the surfaces (K + 1, 13), and
@@ -57,8 +52,8 @@ def refine(
 def _label_blocks(
     first: int,
     after: int,
-    surfaces: NDArray[np.int32],
-    labels: NDArray[np.int32],
+    surfaces: Ints,
+    labels: Ints,
     data: Singles,
     problem: Problem,
     models: Models,
@@ -109,7 +104,7 @@ def _expand_near(
 @njit(cache=True, nogil=True)
 def _expand(
     alpha: int,
-    front: NDArray[np.int32],
+    front: Ints,
     rows: tuple[int, int],
     reach: int,
     labelling: GridLabelling,

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from rangeseg_ros.core.arrays import Ints
 from rangeseg_ros.core.by_planes.labelling import refine
 from rangeseg_ros.core.by_planes.patches import Nodes, find_patches
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, costs
@@ -21,7 +19,7 @@ from rangeseg_ros.core.sensing.grid import View
 class Labelling:
     """Planes, those of `models`, as labels (H, W) of the pixels of an image; 0 is no plane."""
 
-    labels: NDArray[np.int32]
+    labels: Ints
     problem: Problem
     models: Models
 

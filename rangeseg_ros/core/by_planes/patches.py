@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.arrays import Floats, Indices, Mask
+from rangeseg_ros.core.arrays import Floats, Indices, Ints, Mask
 from rangeseg_ros.core.by_planes.region_graph import find_roots, renumbered, singles
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import NODE, Blocks
@@ -111,7 +111,7 @@ def _weigh(
             blocks.residual[bi, bj] *= weight
 
 
-def find_patches(nodes: Nodes, sensor: SensorModel) -> tuple[NDArray[np.int32], Floats]:
+def find_patches(nodes: Nodes, sensor: SensorModel) -> tuple[Ints, Floats]:
     """Connected blocks on one plane, over which the distortion is nearly constant.
 
     The patch (rows, columns) of each block, 0 for none, otherwise 1...P, and moments (P + 1, 13).
@@ -129,7 +129,7 @@ def find_patches(nodes: Nodes, sensor: SensorModel) -> tuple[NDArray[np.int32], 
 @njit(cache=True, nogil=True)
 def _patches(
     first: int, after: int, nodes: Nodes, largest: float, agreement: float
-) -> tuple[NDArray[np.int32], Floats]:
+) -> tuple[Ints, Floats]:
     """Patches of at most `largest` pixels in some rows of blocks, 1...P, and their moments.
 
     `agreement`: by how much the noise of neighbours exceeds white noise, see `SensorModel`.

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.arrays import Floats, Singles
+from rangeseg_ros.core.arrays import Floats, Ints, Singles
 from rangeseg_ros.core.by_planes.shifts import Shifts, shift_at
 from rangeseg_ros.core.graphcut.expansion import link_costs
 from rangeseg_ros.core.runtime.threads import map_halves
@@ -110,7 +110,7 @@ def data_cost(label: int, p: int, problem: Problem, models: Models) -> float:
 
 
 @njit(cache=True)
-def costs(labels: NDArray[np.int32], problem: Problem, models: Models) -> Singles:
+def costs(labels: Ints, problem: Problem, models: Models) -> Singles:
     """What each pixel's label costs it, (n,); 0 where nothing was measured."""
     cost = np.zeros(len(labels), np.float32)
     for p in range(len(labels)):

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.arrays import Floats, Indices, Mask
+from rangeseg_ros.core.arrays import Floats, Indices, Ints, Mask
 from rangeseg_ros.core.sensing.moments import COUNT, sum_by_label
 
 
@@ -19,15 +19,15 @@ class Contacts(NamedTuple):
     others: chains are shorter than the rows of a matrix, and the shorter to clear.
     """
 
-    head: NDArray[np.int32]  # (N,), first half-edge of each part, -1 for none
-    link: NDArray[np.int32]  # (2E,), the next one of the same part, -1 for none
-    target: NDArray[np.int32]  # (2E,), part that a half-edge leads to
+    head: Ints  # (N,), first half-edge of each part, -1 for none
+    link: Ints  # (2E,), the next one of the same part, -1 for none
+    target: Ints  # (2E,), part that a half-edge leads to
     length: Floats  # (E,), of the common border, blocks; 0 where parts were joined
-    place: NDArray[np.int32]  # (N,), room for `absorb`, all -1
+    place: Ints  # (N,), room for `absorb`, all -1
 
 
 @njit(cache=True, nogil=True)
-def find_contacts(part: NDArray[np.int32], right: Mask, below: Mask, count: int) -> Contacts:
+def find_contacts(part: Ints, right: Mask, below: Mask, count: int) -> Contacts:
     """Contacts between parts 1...count - 1 of blocks (rows, columns), 0 for none, see `Nodes`."""
     rows, columns = part.shape
     head = np.full(count, -1, np.int32)
@@ -120,7 +120,7 @@ def find_roots(parent: NDArray[Any]) -> NDArray[Any]:
 
 
 @njit(cache=True, nogil=True)
-def renumbered(root: Indices, moments: Floats, least: float) -> tuple[NDArray[np.int32], Floats]:
+def renumbered(root: Indices, moments: Floats, least: float) -> tuple[Ints, Floats]:
     """Number the clusters of at least so many pixels 1...K, the rest 0; their moments."""
     pixels, number, count = np.zeros(len(root)), np.zeros(len(root), np.int32), 0
     for a in range(len(root)):

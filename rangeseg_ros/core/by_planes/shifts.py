@@ -12,9 +12,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from rangeseg_ros.core.arrays import Floats, Indices, Singles
+from rangeseg_ros.core.arrays import Floats, Indices, Ints, Singles
 from rangeseg_ros.core.fitting.region_sums import find_boxes
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import RATIO
@@ -39,12 +38,7 @@ class Shifts(NamedTuple):
 
 
 def shifts(
-    surfaces: NDArray[np.int32],
-    blocks: Floats,
-    theta: Floats,
-    reach: int,
-    around: int,
-    agreement: float,
+    surfaces: Ints, blocks: Floats, theta: Floats, reach: int, around: int, agreement: float
 ) -> Shifts:
     """Shifts of planes (K + 1, 3) to the blocks of their surfaces (rows, columns), 0 for none.
 
@@ -74,12 +68,12 @@ def shift_at(local: Shifts, label: int, row: int, column: int) -> float:
     return local.values[local.start[label] + i * box[3] + j]
 
 
-def _inner(surfaces: NDArray[np.int32]) -> NDArray[np.int32]:
+def _inner(surfaces: Ints) -> Ints:
     """Surfaces without the blocks beside others, which may hold pixels of these."""
     # Of no surface the highest number, which is never the least of some.
     window, below = np.ones((3, 3), np.uint8), (surfaces - 1).astype(np.uint16)
     most, least = cv2.dilate(below + np.uint16(1), window), cv2.erode(below, window)
-    inner: NDArray[np.int32] = surfaces * (most == least + np.uint16(1))
+    inner: Ints = surfaces * (most == least + np.uint16(1))
     return inner
 
 
@@ -88,7 +82,7 @@ def _find_shifts(
     first: int,
     after: int,
     local: Shifts,
-    inner: NDArray[np.int32],
+    inner: Ints,
     blocks: Floats,
     theta: Floats,
     around: int,

@@ -12,9 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from rangeseg_ros.core.arrays import Floats, Indices, Labels, Mask
+from rangeseg_ros.core.arrays import Floats, Indices, Ints, Labels, Mask
 from rangeseg_ros.core.by_planes.patches import Nodes
 from rangeseg_ros.core.by_planes.plane_energy import region_moments
 from rangeseg_ros.core.by_planes.posterior import PLANE_BEND
@@ -66,8 +65,8 @@ class Expected(NamedTuple):
 
 
 def join_surfaces(
-    patches: NDArray[np.int32], moments: Floats, nodes: Nodes, view: View, smoothness: float
-) -> tuple[NDArray[np.int32], Floats]:
+    patches: Ints, moments: Floats, nodes: Nodes, view: View, smoothness: float
+) -> tuple[Ints, Floats]:
     """Group the patches (rows, columns) of blocks, of moments (P + 1, 13), into planar surfaces.
 
     The surface of each block, 0 for none, otherwise 1...K, and moments (K + 1, 13). Those with
@@ -97,8 +96,8 @@ def unite_regions(regions: Labels, view: View, smoothness: float) -> tuple[Label
 
 @njit(cache=True, nogil=True)
 def _agglomerate(
-    labels: NDArray[np.int32], right: Mask, below: Mask, moments: Floats, expected: Expected
-) -> tuple[Indices, NDArray[np.int32]]:
+    labels: Ints, right: Mask, below: Mask, moments: Floats, expected: Expected
+) -> tuple[Indices, Ints]:
     """Merge the parts 1...P of an image of labels, those that are likeliest one surface first.
 
     Returns the root (P + 1,) of each, and the pairs (E, 2) of parts that touch and are not merged.
@@ -138,7 +137,7 @@ def _agglomerate(
 
 
 @njit(cache=True)
-def _ends(target: NDArray[np.int32], e: int) -> tuple[int, int]:
+def _ends(target: Ints, e: int) -> tuple[int, int]:
     """The parts of a contact, the earlier one first."""
     one, other = int(np.intp(target[2 * e])), int(np.intp(target[2 * e + 1]))
     return min(one, other), max(one, other)

@@ -13,7 +13,7 @@ from mapbox_earcut import triangulate_float64
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.arrays import Floats, Indices, Labels, Mask, Singles
+from rangeseg_ros.core.arrays import Floats, Indices, Ints, Labels, Mask, Singles
 from rangeseg_ros.core.sensing.camera import Camera
 
 # Distance of the polygon from the outline at most, pixels: what segmentation leaves open.
@@ -71,7 +71,7 @@ class Outline:
         return corners, np.repeat(np.arange(len(length)), length)
 
     @cached_property
-    def _contours(self) -> tuple[list[NDArray[np.int32]], NDArray[Any]]:
+    def _contours(self) -> tuple[list[Ints], NDArray[Any]]:
         """Borders (N, 2) on the lattice of corners, and the number of the one around each, or -1.
 
         A pixel covers its four corners: contours run along the sides of the pixels, those of holes
@@ -90,7 +90,7 @@ class Outline:
         outer = np.flatnonzero(around < 0).tolist()
         return max(outer, key=lambda k: cv2.contourArea(contours[k]))
 
-    def _simplified(self, contour: NDArray[np.int32]) -> Floats:
+    def _simplified(self, contour: Ints) -> Floats:
         """Points (N, 3) on the plane of a contour without the corners that say little."""
         corners = np.asarray(cv2.approxPolyDP(contour, TOLERANCE, True)[:, 0], np.int32)
         rays = self._clipped(self._rays(corners))[:, 2:]
@@ -115,7 +115,7 @@ class Outline:
         order = np.argsort(np.append(np.flatnonzero(kept), ends + 0.5), kind='stable')
         return np.concatenate([corners[kept], crossing])[order]
 
-    def _rays(self, corners: NDArray[np.int32]) -> Floats:
+    def _rays(self, corners: Ints) -> Floats:
         """Places (x, y) in the image and rays (N, 5) of corners (x, y) of pixels in the box."""
         if isinstance(self.rays, Camera):
             places = corners + np.array([self.column - 0.5, self.row - 0.5])

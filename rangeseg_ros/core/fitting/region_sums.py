@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.arrays import Floats, Indices, Labels, Mask, Singles
+from rangeseg_ros.core.arrays import Floats, Indices, Ints, Labels, Mask, Singles
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.moments import (
     CHI2,
@@ -142,7 +142,7 @@ def find_boxes(labels: NDArray[np.integer], count: int) -> Indices:
 
 
 @njit(cache=True, nogil=True)
-def _labels_of_blocks(labels: Labels) -> NDArray[np.int32]:
+def _labels_of_blocks(labels: Labels) -> Ints:
     """Labels (rows, columns) of all pixels of each block; -1 where they have several."""
     height, width = labels.shape
     result = np.empty((-(-height // BLOCK), -(-width // BLOCK)), np.int32)
@@ -168,7 +168,7 @@ def _cell_of(layout: Layout, label: int, bi: int, bj: int) -> int:
 @njit(cache=True, nogil=True)
 def _accumulate(
     labels: Labels,
-    inside: NDArray[np.int32],
+    inside: Ints,
     inverse: Singles,
     rays: Singles,
     pinhole: bool,

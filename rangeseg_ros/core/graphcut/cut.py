@@ -25,7 +25,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.arrays import Floats, Mask
+from rangeseg_ros.core.arrays import Floats, Ints, Mask
 
 # Parents that are not a neighbour: those have the number of their side, 0 to 3.
 _TERMINAL, _ORPHAN, _FREE = 4, 5, 6
@@ -37,19 +37,19 @@ class _Flow(NamedTuple):
     The source stands for staying, the sink for switching.
     """
 
-    neighbour: NDArray[np.int32]  # (n, 4), node on each side, -1 for none
+    neighbour: Ints  # (n, 4), node on each side, -1 for none
     residual: Floats  # (n, 4), what the edge to that side can still take
     terminal: Floats  # (n,), that of the source, of the sink where negative
     parent: NDArray[np.int8]  # (n,), side of the parent in its tree
     sink: Mask  # (n,), whether the tree is that of the sink
-    stamp: NDArray[np.int32]  # (n,), when the distance to the terminal was last known
-    depth: NDArray[np.int32]  # (n,), that distance
-    queue: NDArray[np.int32]  # (n,), ring of the nodes from which the trees grow
+    stamp: Ints  # (n,), when the distance to the terminal was last known
+    depth: Ints  # (n,), that distance
+    queue: Ints  # (n,), ring of the nodes from which the trees grow
     queued: Mask  # (n,), whether a node is in it
 
 
 @njit(cache=True, nogil=True)
-def minimum_cut(excess: Floats, neighbour: NDArray[np.int32], link: Floats) -> Mask:
+def minimum_cut(excess: Floats, neighbour: Ints, link: Floats) -> Mask:
     """Choice x (n,) bool that minimises sum excess x + sum link |x - x of the neighbour|.
 
     Of several, the one that chooses fewest nodes. `excess` (n,) is the cost of choosing a node, of
@@ -150,7 +150,7 @@ def _wait(flow: _Flow, p: int, last: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _push(flow: _Flow, p: int, side: int, orphans: NDArray[np.int32]) -> int:
+def _push(flow: _Flow, p: int, side: int, orphans: Ints) -> int:
     """Push what the path over the edge from `p` can take; how many `orphans` that makes."""
     neighbour, residual = flow.neighbour, flow.residual
     terminal, parent = flow.terminal, flow.parent

@@ -14,29 +14,27 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.arrays import Floats, Mask, Singles
+from rangeseg_ros.core.arrays import Floats, Ints, Mask, Singles
 from rangeseg_ros.core.graphcut.cut import minimum_cut
 from rangeseg_ros.core.sensing.grid import Grid
 
 ROUNDING = 1e-3
 """A move must lower the energy by more than the rounding of its sums."""
 # Of each label: start (K + 1,) and sites (N,), label k's from start[k] to start[k + 1].
-Sites = tuple[NDArray[np.int64], NDArray[np.int32]]
+Sites = tuple[NDArray[np.int64], Ints]
 
 
 class GridLabelling(NamedTuple):
     """A labelling of n pixels, in raster order, while expansions change it."""
 
-    labels: NDArray[np.int32]  # (n,)
+    labels: Ints  # (n,)
     data: Singles  # (n,), data cost of each pixel's label
     links: Singles  # (2, n), see `link_costs`
     width: int  # pixels in a row
-    position: NDArray[np.int32]  # (n,), scratch of the expansions: -1 between them
+    position: Ints  # (n,), scratch of the expansions: -1 between them
 
     @classmethod
-    def of(
-        cls, labels: NDArray[np.int32], data: Singles, links: Singles, width: int
-    ) -> GridLabelling:
+    def of(cls, labels: Ints, data: Singles, links: Singles, width: int) -> GridLabelling:
         """Begin with these labels and data costs, which change in place."""
         return cls(labels, data, links, width, np.full(len(labels), -1, np.int32))
 
@@ -64,9 +62,7 @@ def link_costs(grid: Grid, smoothness: float) -> Singles:
     return result.reshape(2, -1)
 
 
-def minimise(
-    labelling: GridLabelling, count: int, cost: Callable[[int, NDArray[np.int32]], Singles]
-) -> None:
+def minimise(labelling: GridLabelling, count: int, cost: Callable[[int, Ints], Singles]) -> None:
     """Expand each of `count` labels over all sites until none helps (listing 4.1); in place.
 
     `cost` gives the data costs (s,) of a label at sites (s,).
@@ -81,9 +77,7 @@ def minimise(
 
 
 @njit(cache=True, nogil=True)
-def expand(
-    alpha: int, sites: NDArray[np.int32], new: Singles, labelling: GridLabelling, least: float
-) -> bool:
+def expand(alpha: int, sites: Ints, new: Singles, labelling: GridLabelling, least: float) -> bool:
     """Give label `alpha` to the best set of sites (s,), none of which has it; in place.
 
     `labelling.position` has their places, `new` (s,) is the data cost of the label there. Returns
@@ -101,7 +95,7 @@ def expand(
 
 
 @njit(cache=True, nogil=True)
-def change(switch: Mask, excess: Floats, neighbour: NDArray[np.int32], link: Floats) -> float:
+def change(switch: Mask, excess: Floats, neighbour: Ints, link: Floats) -> float:
     """What the energy changes by where sites (s,) `switch`; the others as of `minimum_cut`."""
     value = 0.0
     for s in range(len(switch)):
@@ -116,8 +110,8 @@ def change(switch: Mask, excess: Floats, neighbour: NDArray[np.int32], link: Flo
 
 @njit(cache=True, nogil=True)
 def switching(
-    alpha: int, sites: NDArray[np.int32], new: Singles, labelling: GridLabelling
-) -> tuple[Floats, NDArray[np.int32], Floats]:
+    alpha: int, sites: Ints, new: Singles, labelling: GridLabelling
+) -> tuple[Floats, Ints, Floats]:
     """What switching costs each site more than staying, and its edges to other sites.
 
     (s,), and neighbours and weights as of `minimum_cut`. Clears `labelling.position`.
@@ -169,7 +163,7 @@ def fronts(labelling: GridLabelling, count: int, rows: tuple[int, int]) -> Sites
 
 
 @njit(cache=True, nogil=True)
-def group_sites(labels: NDArray[np.int32], sites: NDArray[np.int32], count: int) -> Sites:
+def group_sites(labels: Ints, sites: Ints, count: int) -> Sites:
     """Sort sites (N,) by their labels (N,), which are below `count`; of a label in order."""
     start = np.zeros(count + 2, np.int64)
     for label in labels:
@@ -184,12 +178,8 @@ def group_sites(labels: NDArray[np.int32], sites: NDArray[np.int32], count: int)
 
 @njit(cache=True, nogil=True)
 def band(
-    alpha: int,
-    front: NDArray[np.int32],
-    reach: int,
-    labelling: GridLabelling,
-    rows: tuple[int, int],
-) -> NDArray[np.int32]:
+    alpha: int, front: Ints, reach: int, labelling: GridLabelling, rows: tuple[int, int]
+) -> Ints:
     """Sites of other labels, in some rows, within `reach` edges of a label.
 
     `front` (m,) are sites next to those of the label, one or more times; those of the label are
@@ -222,9 +212,7 @@ def band(
 
 
 @njit(cache=True, nogil=True)
-def beyond(
-    alpha: int, sites: NDArray[np.int32], labelling: GridLabelling, rows: tuple[int, int]
-) -> NDArray[np.int32]:
+def beyond(alpha: int, sites: Ints, labelling: GridLabelling, rows: tuple[int, int]) -> Ints:
     """Sites beyond a band that the label has won up to its far side, in some rows.
 
     They are next to a site of the band that has the label by now, and neither in the band nor of

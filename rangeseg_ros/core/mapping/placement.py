@@ -12,7 +12,9 @@ import numpy as np
 
 from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.mapping.odometry import Motion
 from rangeseg_ros.core.mapping.transforms import Transform, TransformError
+from rangeseg_ros.core.rotations import rotation_by
 from rangeseg_ros.core.significance import CLEARLY, chi2_quantile
 
 Lookup = Callable[[str, str], Transform]
@@ -114,36 +116,64 @@ def find_placement(
 
 
 class UpFilter:
-    """Up by all that tells it; while nothing does, the last one, with an error that grows."""
+    """Up by all that tells it; while nothing does, the last one, with an error that grows.
 
-    _last: tuple[int, Up, float | None] | None = None
+    It turns as the planes say that the camera has turned, where the odometry follows these.
+    """
 
-    def settle(self, found: Placement, stamp: int, config: Config) -> Placement:
+    _told: tuple[int, Up, float | None] | None = None
+    _motion: Motion | None = None  # of the frame whose up was told last
+    _before = 0  # stamp of the last frame
+
+    def settle(
+        self, found: Placement, stamp: int, config: Config, motion: Motion | None = None
+    ) -> Placement:
         """What was `found` at a stamp, nanoseconds, with its up, or why that is lost.
 
         What is told is weighted by its precision. It is lost where two directions contradict each
-        other, and where the steepest ground may be level as well.
+        other, and where the steepest ground may be level as well. `motion` is that of the camera
+        up to the last frame.
         """
         if not found.asked:
             return found
+        if motion is None or (self._told and self._told[0] == self._before):
+            self._motion = motion
+        since, self._before = (stamp - self._before) / 1e9, stamp
         why = _contradiction(found.ups)
         if found.ups and not why:
             weight = np.array([up.sd**-2 for up in found.ups])
             direction = weight @ [up.direction for up in found.ups]
             direction /= np.linalg.norm(direction)
             sd = found.ups[0].sd if len(weight) == 1 else float(weight.sum() ** -0.5)
-            self._last = stamp, Up(direction, sd, found.sources['up']), found.height
+            self._told = stamp, Up(direction, sd, found.sources['up']), found.height
             return replace(found, up=direction, up_sd=sd)
         why = why or found.sources['up'].removeprefix(f'{PARAMETERS}; ')
-        if self._last is not None and not found.ups:
-            then, up, height = self._last
-            age = (stamp - then) / 1e9
-            sd = math.hypot(up.sd, config.up_drift * age)
+        if self._told is not None and not found.ups:
+            then, up, height = self._told
+            age, by, direction = (stamp - then) / 1e9, '', up.direction
+            error = config.up_drift * age
+            if motion and self._motion:
+                turned, open_ = _turned(direction, self._motion, motion, since)
+                if (less := math.hypot(open_, config.up_drift * since)) <= error:
+                    direction, error, by = turned, less, ' by planes'
+            sd = math.hypot(up.sd, error)
             if age >= 0 and CLEARLY * sd <= config.ground_slope:
-                held = f'held for {age:.1f} s, +- {sd:.1f} degrees: {why}'
+                held = f'held{by} for {age:.1f} s, +- {sd:.1f} degrees: {why}'
                 sources = found.sources | {'up': held}
-                return replace(found, up=up.direction, up_sd=sd, height=height, sources=sources)
+                return replace(found, up=direction, up_sd=sd, height=height, sources=sources)
         return replace(found, lost=f'no terrain, as up is not known: {why}')
+
+
+def _turned(up: Floats, before: Motion, now: Motion, since: float) -> tuple[Floats, float]:
+    """A direction (3,) some seconds later, and its standard deviation by the way, degrees.
+
+    Per axis across it: the covariance of the odometry grows by what planes leave open.
+    """
+    fixed = before.pose.rotation @ up
+    more = (now.covariance - before.covariance)[3:, 3:]
+    variance = max(float(np.trace(more) - fixed @ more @ fixed) / 2, 0.0)
+    turned = rotation_by(-since * now.velocity[3:]) @ now.pose.rotation.T @ fixed
+    return turned, math.degrees(math.sqrt(variance))
 
 
 def _contradiction(ups: Sequence[Up]) -> str:
