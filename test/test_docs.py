@@ -182,10 +182,7 @@ def test_the_table_of_constants_is_that_of_the_code():
 
 
 def constants():
-    """Numbers in capitals at the top level of the modules of the core: expression, comment.
-
-    A comment is on the line, above the lines that it is one block with, or a string below.
-    """
+    """Numbers in capitals of modules of the core, and the comment beside, above or below each."""
     core = PACKAGE / 'core'
     for path in core.rglob('*.py'):
         name = path.relative_to(core).with_suffix('').as_posix()

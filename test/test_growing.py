@@ -40,8 +40,7 @@ def grown(inverse, noise=NOISE, seed=0, least=1, **sensor):
 def covered(labels):
     """Share of some blocks that have a surface; all must have the same.
 
-    Single blocks may be left over where the patches around them have grown to their full size:
-    their pixels find the surface later.
+    Single ones are left over where the patches around have grown to their full size.
     """
     assert np.isin(labels, [0, labels.max()]).all()
     return (labels > 0).mean()

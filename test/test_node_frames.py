@@ -188,6 +188,16 @@ def test_without_an_up_there_is_no_terrain(tf_messages):
         assert 0 < published(bench, ahead=71)[1] < 0.9 * sure
 
 
+def test_planes_hold_up_where_tf_has_stopped(tf_messages):
+    """For longer than the 3 s by default, with the odometry."""
+    settings = {'gravity_frame': 'odom', 'tf_timeout': 0.1, 'odometry': True}
+    with started(outputs=['terrain'], **settings) as bench:
+        robot = Robot(bench, tf_messages)
+        bench.until(lambda: 1 in bench.answer('terrain', sent(bench, robot)).data)
+        assert all(1 in bench.answer('terrain', sent(bench, ahead=k)).data for k in range(1, 9))
+        bench.status(lambda s: 'held by planes' in values_of(s)['up from'])
+
+
 @pytest.fixture(scope='module')
 def robot(tf_messages):
     with started(outputs=('labels', 'planes', 'markers'), **FRAMES, tf_timeout=20.0) as bench:

@@ -38,9 +38,8 @@ def room(seed, noise='measured', width=640, height=480):
 def test_accuracy_on_simulated_rooms(width, height, noise, mean_iou, share):
     """Well above the best peer on such rooms (0.926 and 94 %; independent 0.910 and 91 %).
 
-    A little below the targets over many rooms (0.96 and 97 %; 0.97 and 98 %): these are 37
-    regions of at least 1000 pixels, correct when they overlap by 80 %. Small images show the same
-    faces.
+    A little below the targets over many rooms (0.96 and 97 %; 0.97 and 98 %): these are 37 regions
+    of 1000 pixels and more, correct when they overlap by 80 %. Small images show the same faces.
     """
     overlaps, normals = [], []
     for seed in range(900, 903 if width == 640 else 906):
