@@ -181,9 +181,9 @@ def describe_regions(
 ) -> list[Plane]:
     """Planes of the regions 1...M of `labels` (H, W), but of those whose pixels determine none.
 
-    `roots` give those of `fits`, asked for late, `probability` (M + 1,) that of the regions to be
-    planes, 1 where it is not given. `sensor` is that of the pixels, of which those of the image
-    may be means.
+    `roots` is `fits.roots` or what waits for its result, `probability` (M + 1,) that of the
+    regions to be planes, 1 where it is not given. `sensor` is that of the pixels, of which those
+    of the image may be means.
     """
     theta = fits.theta
     probability = np.ones(len(theta)) if probability is None else probability

@@ -183,11 +183,12 @@ def _cropped(lines: Singles, factor: int) -> int:
 
 def _spectrum(differences: NDArray[Any], distance: NDArray[Any], periods: slice) -> Floats:
     """Amplitude of the size of differences along lines at each period, in standard errors."""
-    size, some = np.abs(differences), slice(None, None, _FEW | 1)
-    known, typical = np.isfinite(size), size.ravel()[some]
-    # Of float32, and of sensors whose steps are wide, many are 0.
-    typical = typical[typical > 1e-5 * distance[:, : size.shape[1]].ravel()[some]]
+    size = np.abs(differences)
+    known = np.isfinite(size)
     count = known.sum(axis=0)
+    # Of other columns in each line. Of float32, and of sensors whose steps are wide, many are 0.
+    some, far = (a.ravel()[:: _FEW | 1] for a in (size, distance[:, : size.shape[1]]))
+    typical = some[(some > 1e-5 * far) & (some < np.inf)]
     waves = _waves(distance.shape[1])[periods, : len(count)]
     if not len(typical) or np.count_nonzero(count) < 2 * _LARGEST:
         return np.zeros(len(waves))
