@@ -197,12 +197,12 @@ def _preprocessed(
     And the errors of its pixels, and the jump edges between bins.
     """
     measured, planes = config.sensor_model == 'measured', config.method == 'planes'
-    quanta = quantisation(image.inverse) if measured else (0.0, 0.0)
+    quanta = quantisation(image.inverse) if measured else None
     bins, scales = begun.result()
     side, nodes = bins.side, Task(Blocks.of, bins.means, NODE) if planes else None
     least = -(-least_pixels(config.min_pixels, image.shape) // side**2)
     stated = SensorModel.from_config(config, image.shape).binned(side)
-    sensor = measured_sensor(scales, stated, quanta) if measured else stated
+    sensor = measured_sensor(scales, stated, quanta) if quanta else stated
     identified = not measured or sensor is not stated
     watch.lap('noise')
     # Method normals tells parallel surfaces apart by jump edges alone, so that one too many on
