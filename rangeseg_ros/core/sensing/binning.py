@@ -5,7 +5,6 @@ Planes are smooth, so that they are found in bins; pixels are looked at where bo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -179,8 +178,8 @@ def _places(pixels: NDArray, side: int) -> list[NDArray]:
     return [pixels[i::side, j::side] for i, j in np.ndindex(side, side)]
 
 
-def _means(values: NDArray | Sequence[NDArray], kept: NDArray | Sequence[NDArray]) -> Singles:
-    """Means (...) of those of the values (K, ...) that are kept; 0 of none."""
+def _means(values: list[NDArray], kept: list[NDArray]) -> Singles:
+    """Means (...) of those of K values (...) each that are kept; 0 of none."""
     total = np.zeros(values[0].shape)
     for each, some in zip(values, kept, strict=True):
         total += np.where(some, each, 0)
