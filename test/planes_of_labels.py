@@ -15,7 +15,7 @@ SQUARE = ((-1, -1, 2), (-1, 1, 2), (1, 1, 2), (1, -1, 2))
 def fit_planes(labels, image, sensor):
     """Plane of every region, fitted and described as those of a segmentation."""
     fits = Fits.of(labels, image, sensor)
-    return describe_regions(labels, image, fits, fits.roots, sensor)
+    return describe_regions(labels, image, fits, fits.roots(), sensor)
 
 
 def painted(camera, *regions):

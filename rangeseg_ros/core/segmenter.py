@@ -142,25 +142,24 @@ class Segmenter:
         regions = plane_regions(labelling.labels, valid, view.grid, view.least)
         # Parts of a plane that holes cut, or that have either of two directions it lies between.
         regions, pairs = unite_regions(regions, view, config.plane_smoothness)
+        fits = Fits.of(regions, view.image, errors, view.blocks)
         pixels: Task[Labels] | None = None
         if isinstance(labelling, by_planes.Labelling) and side > 1:
             given = regions, labelling.labels, labelling.models, image, side, sensor
             pixels = Task(with_sharp_borders, *given, config.plane_smoothness * sensor.patch)
-        fits = Fits.of(regions, view.image, errors, view.blocks)
-        roots = Task(fits.roots)
         probability = plane_probabilities(fits, pairs, config.plane_prior)
         # Of directions, all regions are planes.
         flat = (probability >= config.plane_probability) | (config.method == 'normals')
         flat[0] = True
         numbers = numbers_of(flat)
         curved = None if config.method == 'normals' else relabel(regions, numbers_of(~flat))
-        fits = fits.without(~flat)
+        fits, roots = fits.without(~flat), fits.roots()[flat]
         watch.lap('regions')
         # Bridged pixels were not measured; some regions have no plane, or one without an end.
         names = (fits.farthest() > 0)[numbers] * numbers
         found = Task(lambda: relabel(pixels.result() if pixels else regions * image.valid, names))
         errors = sensor if pixels else errors
-        described = fits, lambda: roots.result()[flat], errors, probability[flat]
+        described = fits, roots, errors, probability[flat]
         planes = describe_regions(relabel(regions, numbers), view.whole, *described)
         labels = found.result()
         result = Segmentation(
@@ -215,7 +214,7 @@ def _preprocessed(
     excess = bins.noise_of_pixels(sensor)
     if side > 1:
         image = bins.of_one_surface(steps.pixels * np.float32(excess**0.5))
-    blocks = scales[0].updated(bins.means, image)
+    blocks = Task(scales[0].updated, bins.means, image)
     # Planes are fitted to what was measured; where they end is found with small holes bridged,
     # which bins of several pixels do not have.
     whole = bridge_holes(image, steps.windows, steps.slopes) if side == 1 else image
@@ -224,7 +223,7 @@ def _preprocessed(
     jumps = jump_edges(whole, config.jump_edges, steps.windows, steps.slopes, steps.pixels)
     grid = grid_of(whole, jumps)
     watch.lap('edges')
-    view = View(image, whole, blocks, grid, sensor, least, bins.area, identified)
+    view = View(image, whole, blocks.result(), grid, sensor, least, bins.area, identified)
     if nodes:
         view = view._replace(nodes=nodes.result())
     return view, sensor.of_pixels(side, excess), jumps

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
@@ -175,23 +174,22 @@ def describe_regions(
     labels: Labels,
     image: RangeImage,
     fits: Fits,
-    roots: Callable[[], Floats],
+    roots: Floats,
     sensor: SensorModel,
     probability: Floats | None = None,
 ) -> list[Plane]:
     """Planes of the regions 1...M of `labels` (H, W), but of those whose pixels determine none.
 
-    `roots` is `fits.roots` or what waits for its result, `probability` (M + 1,) that of the
-    regions to be planes, 1 where it is not given. `sensor` is that of the pixels, of which those
-    of the image may be means.
+    `roots` (M + 1, 3, 3) are those of the fits, `probability` (M + 1,) is that of the regions to
+    be planes, 1 where it is not given. `sensor` is that of the pixels, of which those of the image
+    may be means.
     """
     theta = fits.theta
     probability = np.ones(len(theta)) if probability is None else probability
     if not theta.any():
         return []
     normal, distance, centroid, rms, confidence = _described(fits, sensor)
-    root = roots()
-    covariance = squares(plane_jacobians(normal, distance) @ root)
+    covariance = squares(plane_jacobians(normal, distance) @ roots)
     if image.place.any():
         # From the sensor to the frame of the points.
         shift = np.eye(4)
@@ -207,7 +205,7 @@ def describe_regions(
         rays = image.camera or image.rays[crop]
         outlines.append(Outline(labels[crop], k, box[0], box[1], theta[k], float(far), rays))
     # Numbers of Python, all at once: taken out of the arrays one by one they take longer.
-    surfaces = common_surfaces(fits, squares(root))
+    surfaces = common_surfaces(fits, squares(roots))
     numbers = surfaces, distance, fits.sums.pixels, rms, confidence, probability
     group, offset, *figures = (column[found].tolist() for column in numbers)
     equations = normal[found], offset, covariance[found]

@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.arrays import Floats, Indices, Ints, Labels, Mask, Singles
+from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.moments import (
     CHI2,
@@ -96,7 +97,8 @@ def sum_regions(
     pixels = labels, inside, image.inverse, image.rays, image.pinhole, image.camera is not None
     moments = blocks.moments.reshape(inside.size, -1)
     planes = fit_sums(sum_by_label(inside.ravel(), moments, len(layout.box)))
-    cells, outside = _accumulate(*pixels, axis, blocks, sensor, layout, planes)
+    halves = map_halves(_accumulate, len(inside), *pixels, axis, blocks, sensor, layout, planes)
+    cells, outside = np.add(*halves)
     owners, count = regions_of(layout.start), len(layout.box)
     total, left_out = (sum_by_label(owners, part, count) for part in (cells, outside))
     outliers = left_out[:, COUNT].astype(np.intp)
@@ -167,6 +169,8 @@ def _cell_of(layout: Layout, label: int, bi: int, bj: int) -> int:
 
 @njit(cache=True, nogil=True)
 def _accumulate(
+    first: int,
+    after: int,
     labels: Labels,
     inside: Ints,
     inverse: Singles,
@@ -179,13 +183,13 @@ def _accumulate(
     layout: Layout,
     theta: Floats,
 ) -> Floats:
-    """Sums (2, N, 29) over the pixels of regions: of inliers of `theta`, of outliers.
+    """Sums (2, N, 29) over rows first...after of blocks: of inliers of `theta`, of outliers.
 
     Of regions whose plane (M + 1, 3) is zero there are no outliers.
     """
     height, width = labels.shape
     cells = np.zeros((2, layout.start[-1], RECORD))
-    for bi in range(len(inside)):
+    for bi in range(first, after):
         bottom = min((bi + 1) * BLOCK, height)
         for bj in range(inside.shape[1]):
             right, squared = min((bj + 1) * BLOCK, width), blocks.squared[bi, bj]
