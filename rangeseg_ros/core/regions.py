@@ -99,7 +99,11 @@ def by_falling_size(area: NDArray[np.integer]) -> Labels:
     return table
 
 
+@njit(cache=True, nogil=True)
 def relabel(regions: NDArray[np.integer], table: Labels) -> Labels:
     """Regions (H, W) by another name: `table` (M + 1,) has the new number of each."""
-    # No region is beyond the table; without a look for one it takes a third of the time.
-    return table.take(regions, mode='clip')
+    renamed = np.empty(regions.shape, np.uint16)
+    for i in range(len(regions)):
+        for j in range(regions.shape[1]):
+            renamed[i, j] = table[regions[i, j]]
+    return renamed
