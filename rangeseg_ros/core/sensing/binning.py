@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.arrays import Singles
 from rangeseg_ros.core.config import VGA
+from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.enlargement import Cells, camera_of_cells
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -95,8 +96,8 @@ class Bins(NamedTuple):
         rays, cloud = self.means.rays, self.means.camera is None
         # Rays of a camera are those of the middles of bins.
         means = rays.copy() if cloud else np.zeros((0, 0, 3), np.float32)
-        pixels = self.pixels.inverse, self.pixels.rays, self.side
-        _average_near_median(*pixels, self.spread, steps, slope, inverse, means)
+        given = self.pixels.inverse, self.pixels.rays, self.side, self.spread, steps, slope
+        map_halves(_average_near_median, len(inverse), *given, inverse, means)
         return replace(self.means, inverse=inverse, rays=means if cloud else rays)
 
 
@@ -125,6 +126,8 @@ def _average(pixels: Singles, side: int, means: Singles, spread: Singles) -> Non
 
 @njit(cache=True, nogil=True)
 def _average_near_median(
+    first: int,
+    after: int,
     pixels: Singles,
     rays: Singles,
     side: int,
@@ -134,9 +137,12 @@ def _average_near_median(
     means: Singles,
     mean_rays: Singles,
 ) -> None:
-    """Average the measurements of bins whose `spread` is wide again, near their median alone."""
+    """Average the measurements of bins in rows first...after anew, near their median alone.
+
+    Of those whose `spread` is wide.
+    """
     values, total = np.empty(side * side, np.float32), np.empty(4)
-    for i in range(len(means)):
+    for i in range(first, after):
         least = steps[i // BLOCK].min()
         for j in range(means.shape[1]):
             if spread[i, j] < least:  # as of most
