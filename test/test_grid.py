@@ -9,7 +9,6 @@ from terrain_scenes import drop_of, scene, stated, view
 from rangeseg_ros import Config
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.ground.grid import GroundMemory
-from rangeseg_ros.core.ground.points import thinned
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.scenes import Pose
@@ -96,12 +95,3 @@ def test_heights_of_a_cell_are_filtered_until_they_contradict(second, height, va
         memory._count(GROUND, points, np.full(2, square), 0.0)
     assert memory._layers[1, 0, 0] == pytest.approx(height)
     assert memory._layers[2, 0, 0] == pytest.approx(variance)
-
-
-def test_a_thinned_cloud_has_a_point_of_every_cube_that_has_any():
-    points = np.random.default_rng(0).uniform(-2, 2, (5000, 4)).astype(np.float32)
-    kept = thinned(points, 0.5)
-    whole, left = (np.unique(np.floor(cloud[:, :3] / 0.5), axis=0) for cloud in (points, kept))
-    assert np.array_equal(left, whole) and len(kept) == len(whole)
-    assert len(thinned(points, 0.01, 1000)) <= 1000
-    assert (thinned(points, 0.0) == points).all()

@@ -18,7 +18,7 @@ from rangeseg_ros.core.ground.stairs import Stairs
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.messages import markers
 from rangeseg_ros.messages.cameras import camera_from_message, camera_info_message
-from rangeseg_ros.messages.clouds import planes_message, stairs_message
+from rangeseg_ros.messages.clouds import planes_message, stairs_message, thinned
 from rangeseg_ros.messages.grids import grid_message, grid_points_message
 from rangeseg_ros.messages.images import depth_from_message, image_message
 from rangeseg_ros.messages.outputs import OUTPUTS
@@ -84,6 +84,15 @@ def test_node_and_replay_write_the_same_bytes(name, planes):
     if not isinstance(offline, bytes):
         offline = bytes(STORE.serialize_cdr(offline, output.kind))
     assert cdr(live, output.kind) == offline
+
+
+def test_a_thinned_cloud_has_a_point_of_every_cube_that_has_any():
+    points = np.random.default_rng(0).uniform(-2, 2, (5000, 4)).astype(np.float32)
+    kept = thinned(points, 0.5)
+    whole, left = (np.unique(np.floor(cloud[:, :3] / 0.5), axis=0) for cloud in (points, kept))
+    assert np.array_equal(left, whole) and len(kept) == len(whole)
+    assert len(thinned(points, 0.01, 1000)) <= 1000
+    assert (thinned(points, 0.0) == points).all()
 
 
 TEXT = st.text(st.characters(exclude_characters='\0', codec='utf-8'), max_size=9)

@@ -9,7 +9,8 @@ from planes_of_labels import painted
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import Camera, Config, ConfigError
-from rangeseg_ros.core.ground.roles import RolesError, corners_of, ramps_of, roles, tilt_of
+from rangeseg_ros.core.description.tilt import tilt_of
+from rangeseg_ros.core.ground.roles import RolesError, ramps_of, roles
 from rangeseg_ros.core.sequence import with_roles
 from rangeseg_ros.messages.markers import of_ramps
 
@@ -48,7 +49,7 @@ def test_the_floor_is_the_surface_at_the_stated_height():
         assert roles(planes(landing, own), LEVEL) == ['lower', 'floor']
     assert roles(planes(table), known) == ['other']
     (plane,) = planes(table)
-    corners = ((corners_of(plane) - plane.centre) @ plane.shape.frame)[:, :2] / (plane.extents / 2)
+    corners = ((plane.corners - plane.centre) @ plane.shape.frame)[:, :2] / (plane.extents / 2)
     assert sorted(corners.round(6).tolist()) == [[-1, -1], [-1, 1], [1, -1], [1, 1]]
     # A table that begins nearer than the floor does, but not as steeply below.
     table, floor = (slice(64, 74), slice(0, 80)), (slice(90, 120), slice(80, 160))

@@ -95,7 +95,7 @@ def test_holes_are_no_scatter_of_cells():
     up, sensor = np.array([0, -np.cos(0.6), -np.sin(0.6)]), SensorModel.from_config(Config())
     inverse = -(CAMERA.rays @ up).astype(np.float32)
     inverse[(inverse < 0.1) | (np.random.default_rng(0).random(inverse.shape) < 0.3)] = 0
-    cells = cells_of(RangeImage(CAMERA.rays, inverse, CAMERA), up, sensor)
+    cells = cells_of(RangeImage(CAMERA.rays, inverse, CAMERA), up, sensor, False)
     seen = cells.inverse > 0
     assert seen.mean() > 0.8 and (cells.variance[seen] > 0).all()
 
@@ -211,9 +211,9 @@ def test_a_chain_goes_on_a_while_after_what_is_off_the_ground():
     """Rows of 2 cm: one 30 mm high, and from then on 16, within half a step but on the same."""
     rows, columns = np.indices((30, 9))
     height = np.select([rows < 10, rows < 11], [0.0, 0.03], 0.016)
-    place = np.stack([height, 0.5 + 0.02 * rows, 0.02 * (columns - 4)])[:, ::-1]
+    place = np.stack([height, 0.5 + 0.02 * rows, 0.02 * (columns - 4)])
     config = Config(robot_radius=0.1, ground_gap=0.1, ground_slope=30.0)
-    reached = reach(place, np.full(rows.shape, 4e-6), config, False)[::-1]
+    reached = reach(place, np.full(rows.shape, 4e-6), config)
     assert reached[:9].all() and not reached[9:13].any()
     # 16 mm and what is left of 14 more after 6 cm are within 25, half a step.
     assert reached[13:].all()
@@ -225,8 +225,8 @@ def test_no_chain_goes_down_an_edge_that_is_blurred_over_two_cells():
     height = np.select([columns < 10, columns < 11], [0.0, -0.015], -0.038)
     # A chain starts where all is ground.
     height[rows < 12] = 0.0
-    place = np.stack([height, 2.0 + 0.04 * rows, 0.034 * columns])[:, ::-1]
-    reached = reach(place, np.full(rows.shape, 0.0055**2), Config(), False)[::-1]
+    place = np.stack([height, 2.0 + 0.04 * rows, 0.034 * columns])
+    reached = reach(place, np.full(rows.shape, 0.0055**2), Config())
     assert reached[:, :9].all() and not reached[20:, 10:].any()
 
 
@@ -235,6 +235,6 @@ def test_ground_between_a_wall_and_a_hole_is_no_slope():
     rows, columns = np.indices((90, 40))
     hole = (rows >= 16) & (rows < 24) & (abs(columns - 20) < 8)
     height = np.where(hole, -0.5, 0.05 * np.maximum(rows - 50, 0))
-    place = np.stack([height, 1 + 0.04 * np.minimum(rows, 50), 0.04 * (columns - 20)])[:, ::-1]
-    reached = reach(place, np.full(rows.shape, 0.006**2), Config(), False)[::-1]
+    place = np.stack([height, 1 + 0.04 * np.minimum(rows, 50), 0.04 * (columns - 20)])
+    reached = reach(place, np.full(rows.shape, 0.006**2), Config())
     assert reached[25:49].all() and not reached[hole].any() and not reached[51:].any()

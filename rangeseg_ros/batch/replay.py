@@ -15,7 +15,7 @@ from rangeseg_ros.batch.result_bag import ResultBag, Timed, open_source, read_re
 from rangeseg_ros.batch.result_folder import LEADING, PICTURES, TERRAIN, ResultFolder
 from rangeseg_ros.compilation.preparation import prepare
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.ground.roles import Tilt
+from rangeseg_ros.core.description.tilt import Tilt
 from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.odometry import Motion
 from rangeseg_ros.core.mapping.placement import Placement

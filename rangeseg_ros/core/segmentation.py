@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.arrays import Floats, Labels, Mask, Singles
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.description.tilt import Tilt, tilt_of
 from rangeseg_ros.core.ground.grid import GroundGrid
-from rangeseg_ros.core.ground.roles import Ramp, Tilt, ramps_of, tilt_of
+from rangeseg_ros.core.ground.roles import Ramp, ramps_of
 from rangeseg_ros.core.ground.stairs import Stairs, stairs_of
 from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.ground.terrain import Terrain

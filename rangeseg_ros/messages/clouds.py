@@ -45,6 +45,9 @@ _STAIRS_TYPE = np.dtype(
 # sensor_msgs/PointField: datatype -> numpy.
 _POINT_FIELD_TYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 
+# Points of a thinned cloud: as many as layers of costmaps take in the time of a frame.
+MOST_POINTS = 20_000
+
 
 def points_from_message(cloud: Any) -> Singles | Floats:
     """Points (H, W, 3), metres, of an organised sensor_msgs/PointCloud2; else MessageError."""
@@ -125,6 +128,25 @@ def planes_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
         for plane in planes
     ]
     return cloud_message(make, header, np.array(rows, PLANE_TYPE))
+
+
+def thinned(points: Singles, resolution: float, most: int = MOST_POINTS) -> Singles:
+    """One of the points (N, K), that begin with x, y, z, of each cube that has any.
+
+    Cubes have sides of `resolution` metres, 0 for all points, and ones twice, four times, ... as
+    long where more than `most` points would be left.
+    """
+    if resolution <= 0 or not len(points):
+        return points
+    kept, cubes = np.arange(len(points)), np.floor(points[:, :3].T / resolution).astype(np.int64)
+    while True:
+        x, y, z = cubes - cubes.min(axis=1, keepdims=True)
+        key = (y * (x.max() + 1) + x) * (z.max() + 1) + z
+        first = np.sort(np.unique(key, return_index=True)[1])
+        kept, cubes = kept[first], cubes[:, first]
+        if len(kept) <= most:
+            return points[kept]
+        cubes >>= 1  # twice as large
 
 
 def points_message(make: Make, header: Any, points: Singles) -> Any:

@@ -8,12 +8,17 @@ import numpy as np
 from numpy.lib.recfunctions import unstructured_to_structured
 
 from rangeseg_ros.core.ground.cells import GROUND, UNKNOWN
-from rangeseg_ros.core.ground.grid import GroundGrid, empty_grid
+from rangeseg_ros.core.ground.grid import GroundGrid
 from rangeseg_ros.core.rotations import rotation_matrix
 from rangeseg_ros.messages.clouds import POINT_TYPE, cloud_message
 from rangeseg_ros.messages.make import GRID, Make, header_of, pose_of
 
 _LETHAL = 100
+# The grid of an image whose ground is not looked for.
+_NONE = np.zeros((0, 0), np.float32)
+_EMPTY = GroundGrid(
+    _NONE.astype(np.uint8), _NONE, _NONE, _NONE, 0.0, np.zeros(3), np.eye(4)[3], ''
+)
 _CELL_TYPE = np.dtype(
     [*POINT_TYPE.descr, ('height_variance', '<f4'), ('class', '<u4'), ('age', '<f4')]
 )
@@ -24,7 +29,7 @@ def grid_message(make: Make, header: Any, grid: GroundGrid | None) -> Any:
 
     `header` is that of the image: its frame is used where the grid has no fixed one.
     """
-    grid = grid or empty_grid()
+    grid = grid or _EMPTY
     values = np.where(grid.classes == GROUND, 0, _LETHAL).astype(np.int8)
     values[grid.classes == UNKNOWN] = -1
     info = make(
@@ -43,7 +48,7 @@ def grid_points_message(make: Make, header: Any, grid: GroundGrid | None) -> Any
 
     z is the height of the ground, or that of the ground below the camera where none was seen.
     """
-    grid = grid or empty_grid()
+    grid = grid or _EMPTY
     rows, columns = np.nonzero(grid.classes != UNKNOWN)
     place = (np.column_stack([columns, rows]) + 0.5) * grid.resolution
     place = np.column_stack([place, np.zeros(len(rows))]) @ rotation_matrix(grid.orientation).T

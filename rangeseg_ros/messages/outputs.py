@@ -53,7 +53,7 @@ def _image(encoding: str, pick: Pick) -> Output:
 
 
 def _points(
-    find: Callable[[RangeImage, Terrain], Singles], most: int = points.MOST_POINTS
+    find: Callable[[RangeImage, Terrain], Singles], most: int = clouds.MOST_POINTS
 ) -> Output:
     """A topic of points of the terrain, thinned to so many."""
 
@@ -61,7 +61,7 @@ def _points(
         if result.ground is None:
             return np.zeros((0, 4), np.float32)
         size = result.survey.config.cloud_resolution if isinstance(result.survey, Survey) else 0.0
-        return points.thinned(find(image, result.ground), size, most)
+        return clouds.thinned(find(image, result.ground), size, most)
 
     return Output(CLOUD, clouds.points_message, pick)
 

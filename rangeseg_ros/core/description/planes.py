@@ -143,6 +143,13 @@ class Plane:
         return self.shape.centre
 
     @property
+    def corners(self) -> Floats:
+        """(4, 3) corners of that rectangle, metres."""
+        half = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) * self.extents / 2
+        corners: Floats = self.centre + half @ self.shape.frame[:, :2].T
+        return corners
+
+    @property
     def orientation(self) -> Floats:
         """(4,) quaternion x, y, z, w of the frame of that rectangle.
 

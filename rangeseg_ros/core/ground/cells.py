@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.arrays import Floats, Mask, Singles
 from rangeseg_ros.core.runtime.threads import map_halves
-from rangeseg_ros.core.sensing.moments import cofactors, ray_of
+from rangeseg_ros.core.sensing.moments import SIZE, fit_all, ray_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 from rangeseg_ros.core.significance import OUTLIER
@@ -35,6 +35,8 @@ _ROWS = 120
 _DOWN, _RIGHT = 4, 2
 # The prior counts as so much of a window full of ground: it decides where little of it is seen.
 _PRIOR = 1 / 16
+# Entries of the symmetric matrix whose upper triangle moments begin with.
+_MATRIX = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 class CellSize(NamedTuple):
@@ -56,7 +58,7 @@ class CellSize(NamedTuple):
 
 
 class Cells(NamedTuple):
-    """Means of the pixels of cells, (rows, columns).
+    """Means of the pixels of cells, (rows, columns), with the nearest row first.
 
     `ray` (3, ...) and `inverse` (...) range, 1/m, of the measured pixels, 0 where less than half
     of them are; `place` (3, ...) on `axes` (3, 3), height above the sensor along up and position
@@ -64,7 +66,7 @@ class Cells(NamedTuple):
     deviation of the height of a pixel, metres: by the sensor model, or by how much neighbouring
     pixels differ where that is more, as it is on grass and gravel. `variance` is that of the mean
     height, 0 where not measured and where pixels are of two surfaces: they differ by more than by
-    noise.
+    noise. `order` of the rows is that of the image.
     """
 
     ray: Singles
@@ -74,6 +76,7 @@ class Cells(NamedTuple):
     variance: Floats
     size: CellSize
     axes: Floats
+    order: slice
 
 
 def axes_of(up: Floats) -> Floats:
@@ -84,14 +87,15 @@ def axes_of(up: Floats) -> Floats:
     return np.array([up, ahead, np.cross(up, ahead)])
 
 
-def cells_of(image: RangeImage, up: Floats, sensor: SensorModel) -> Cells:
-    """Cells of an image; `up` (3,) is a unit vector in its frame."""
+def cells_of(image: RangeImage, up: Floats, sensor: SensorModel, turned: bool) -> Cells:
+    """Cells of an image; `up` (3,) is a unit vector in its frame, `turned` where it is down."""
     size, axes = CellSize.for_image(image.shape), axes_of(up)
     shape = -(-image.shape[0] // size.rows), -(-image.shape[1] // size.columns)
     values = np.empty((6, *shape), np.float32)
+    map_halves(_means, shape[0], image.inverse, image.rays, image.pinhole, size, values)
+    order = slice(None, None, 1 if turned else -1)
+    values = np.ascontiguousarray(values[:, order])
     ray, inverse, scatter = values[:3], values[3], values[4:]
-    means = ray, inverse, scatter
-    map_halves(_means, shape[0], image.inverse, image.rays, image.pinhole, size, *means)
     with np.errstate(divide='ignore', invalid='ignore'):
         place = np.tensordot(axes.astype(np.float32), ray, 1) / inverse
         place[:, inverse == 0] = np.nan
@@ -103,7 +107,7 @@ def cells_of(image: RangeImage, up: Floats, sensor: SensorModel) -> Cells:
     share = sensor.white / (size.rows * size.columns) + 1 - sensor.white
     # No height is known better than it is computed, far away least of all.
     of_mean = np.where(whole, error.astype(np.float64) ** 2 * share + 1e-8 + rounding**2, 0.0)
-    return Cells(ray, inverse, place, error.astype(np.float32), of_mean, size, axes)
+    return Cells(ray, inverse, place, error.astype(np.float32), of_mean, size, axes, order)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -114,9 +118,7 @@ def _means(
     rays: Singles,
     pinhole: bool,
     size: CellSize,
-    ray: Singles,
-    mean: Singles,
-    scatter: Singles,
+    values: Singles,
 ) -> None:
     """Of rows first...after of cells: mean ray, mean inverse range, and the scatter of that.
 
@@ -124,7 +126,7 @@ def _means(
     of the noise wherever the surface changes little from pixel to pixel. Down the columns, where
     ground recedes, it is that of differences about their mean.
     """
-    height, width = inverse.shape
+    (height, width), ray, mean, scatter = inverse.shape, values[:3], values[3], values[4:]
     for i in range(first, after):
         for c in range(mean.shape[1]):
             x = y = z = total = squares = fall = falls = np.float32(0)
@@ -162,8 +164,7 @@ class GroundField(NamedTuple):
 
     def turned(self) -> GroundField:
         """Of the image with rows and columns exchanged."""
-        theta = np.ascontiguousarray(self.theta.transpose(0, 2, 1))
-        return GroundField(theta, CellSize(self.size.columns, self.size.rows), self.up)
+        return GroundField(self.theta.transpose(0, 2, 1), CellSize(*self.size[::-1]), self.up)
 
     def heights(self, cells: Cells) -> Singles:
         """Heights (rows, columns) of cells above the ground, metres; NaN where not measured."""
@@ -208,33 +209,19 @@ def _sums(ray: Singles, inverse: Singles, ground: Mask) -> Floats:
     return sums
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def _fitted(sums: Floats, p: Floats) -> Floats:
-    """Planes (M, N, 3) that fit the ground in windows of 3 x 3 blocks and all rays on plane p."""
-    _, rows, columns, _ = sums.shape
-    theta = np.empty((rows, columns, 3))
-    g, s = np.empty(9), np.empty(9)
-    for i in range(rows):
-        for j in range(columns):
-            g[:], s[:] = 0, 0
-            for k in range(max(i - 1, 0), min(i + 2, rows)):
-                for m in range(max(j - 1, 0), min(j + 2, columns)):
-                    g += sums[0, k, m]
-                    s += sums[1, k, m]
-            for n in range(3):
-                theta[i, j, n] = p[n]
-            total = g + _PRIOR * s
-            # What the ground is off the prior plane.
-            x = g[6] - g[0] * p[0] - g[1] * p[1] - g[2] * p[2]
-            y = g[7] - g[1] * p[0] - g[3] * p[1] - g[4] * p[2]
-            z = g[8] - g[2] * p[0] - g[4] * p[1] - g[5] * p[2]
-            a, b, c, d, e, f = total[0], total[1], total[2], total[3], total[4], total[5]
-            aa, bb, cc, dd, ee, ff, determinant = cofactors(a, b, c, d, e, f)
-            if g[0] + g[3] + g[5] != 0 and determinant > 1e-13 * a * d * f:
-                theta[i, j, 0] += (aa * x + bb * y + cc * z) / determinant
-                theta[i, j, 1] += (bb * x + dd * y + ee * z) / determinant
-                theta[i, j, 2] += (cc * x + ee * y + ff * z) / determinant
-    return theta
+def _fitted(sums: Floats, prior: Floats) -> Floats:
+    """Planes (M, N, 3) that fit the ground in windows of 3 x 3 blocks and all rays on the prior.
+
+    That is the plane (3,) itself where there is no ground.
+    """
+    ground, seen = (cv2.blur(a, (3, 3), borderType=cv2.BORDER_CONSTANT) for a in sums)
+    moments = np.zeros((*ground.shape[:2], SIZE))
+    moments[..., :9] = ground
+    moments[..., :6] += _PRIOR * seen[..., :6]
+    moments[..., 6:9] += _PRIOR * (seen[..., _MATRIX] * prior).sum(axis=3)
+    theta = fit_all(moments.reshape(-1, SIZE))[0].reshape(*ground.shape[:2], 3)
+    known = theta.any(axis=2) & (ground[..., 5] > 0)
+    return np.where(known[..., None], theta, prior)
 
 
 def classify(
@@ -249,8 +236,7 @@ def classify(
     classes, heights = np.empty(image.shape, np.uint8), np.empty(image.shape, np.float32)
     rise = np.tensordot(field.up.astype(np.float32), field.theta, 1)
     pixels = image.inverse, image.rays, image.pinhole
-    cells = field.theta, rise, field.size, bounds
-    map_halves(_classify, bounds.shape[1], *pixels, *cells, classes, heights)
+    map_halves(_classify, len(rise), *pixels, field, rise, bounds, classes, heights)
     return classes, heights
 
 
@@ -261,15 +247,14 @@ def _classify(
     inverse: Singles,
     rays: Singles,
     pinhole: bool,
-    theta: Singles,
+    field: GroundField,
     rise: Singles,
-    size: CellSize,
     bounds: Singles,
     classes: NDArray[np.uint8],
     heights: Singles,
 ) -> None:
     """Of rows first...after of cells."""
-    height, width = inverse.shape
+    (height, width), (theta, size, _) = inverse.shape, field
     for i in range(first, after):
         for v in range(i * size.rows, min((i + 1) * size.rows, height)):
             for c in range(rise.shape[1]):

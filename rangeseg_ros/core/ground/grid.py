@@ -61,12 +61,6 @@ class GroundGrid(NamedTuple):
         )
 
 
-def empty_grid() -> GroundGrid:
-    """The grid of an image whose ground is not looked for."""
-    empty, classes = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.uint8)
-    return GroundGrid(classes, empty, empty, empty, 0.0, np.zeros(3), np.array([0, 0, 0, 1.0]), '')
-
-
 class GroundMemory:
     """What one camera has seen of the ground: the grid, and how high it is above the ground."""
 

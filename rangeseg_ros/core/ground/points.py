@@ -12,9 +12,6 @@ from rangeseg_ros.core.ground.terrain import Terrain
 from rangeseg_ros.core.sensing.clouds import completed_rays
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
-# Points of a thinned cloud: as many as layers of costmaps take in the time of a frame.
-MOST_POINTS = 20_000
-
 
 def points_of_class(image: RangeImage, terrain: Terrain, kind: int) -> Singles:
     """Points (N, 4) of the pixels of a class: x, y, z and height above the ground, metres.
@@ -30,25 +27,6 @@ def points_of_class(image: RangeImage, terrain: Terrain, kind: int) -> Singles:
         points[:, k] += shift
     points[:, 3] = terrain.height.take(where)
     return points
-
-
-def thinned(points: Singles, resolution: float, most: int = MOST_POINTS) -> Singles:
-    """One of the points (N, K), that begin with x, y, z, of each cube that has any.
-
-    Cubes have sides of `resolution` metres, 0 for all points, and ones twice, four times, ... as
-    long where more than `most` points would be left.
-    """
-    if resolution <= 0 or not len(points):
-        return points
-    kept, cubes = np.arange(len(points)), np.floor(points[:, :3].T / resolution).astype(np.int64)
-    while True:
-        x, y, z = cubes - cubes.min(axis=1, keepdims=True)
-        key = (y * (x.max() + 1) + x) * (z.max() + 1) + z
-        first = np.sort(np.unique(key, return_index=True)[1])
-        kept, cubes = kept[first], cubes[:, first]
-        if len(kept) <= most:
-            return points[kept]
-        cubes >>= 1  # twice as large
 
 
 def drops(image: RangeImage, terrain: Terrain) -> Singles:

@@ -24,13 +24,13 @@ _BESIDE = 4
 _BASELINES = 6
 
 
-def reach(place: Floats, variance: Floats, config: Config, turned: bool) -> Mask:
+def reach(place: Floats, variance: Floats, config: Config) -> Mask:
     """Cells (rows, columns) that a chain leads to.
 
     `place` (3, rows, columns) is height and horizontal position, metres, NaN where nothing is
-    measured; `variance` that of the height, 0 for cells that are no part of a chain. The nearest
-    row is the last, or the first where `turned`. `robot_radius` says how far ground is looked for
-    that leads to a cell, and how much farther than the nearest ground in view a chain begins.
+    measured, with the nearest row first; `variance` that of the height, 0 for cells that are no
+    part of a chain. `robot_radius` says how far ground is looked for that leads to a cell, and how
+    much farther than the nearest ground in view a chain begins.
     """
     step, slope, radius = config.least_step, config.steepest, config.robot_radius
     across = Task(_without_steps, 1, place, variance, step, slope)
@@ -38,8 +38,6 @@ def reach(place: Floats, variance: Floats, config: Config, turned: bool) -> Mask
     reached = np.zeros(even.shape, np.bool_)
     if not even.any():
         return reached
-    order = slice(None, None, 1 if turned else -1)
-    place, variance, even = place[:, order], variance[order], even[order]
     # Where the ground comes into view, no farther than the robot is wide from the nearest of it,
     # and no step above or below most of that. It is near height 0, if anything is.
     begin = even & (np.abs(place[0]) < HIGHEST)
@@ -51,7 +49,7 @@ def reach(place: Floats, variance: Floats, config: Config, turned: bool) -> Mask
     start = near & (np.abs(h - np.median(h[near])) < step / 2)
     reached[front[start], columns[start]] = True
     _spread(place, variance, even, step / 2, slope, config.ground_gap, radius, reached)
-    return reached[order]
+    return reached
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

@@ -1,4 +1,4 @@
-"""What planes are to a robot: floor, ramp, step, table, wall, and which way they say is up."""
+"""What planes are to a robot: floor, ramp, step, table, wall."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from rangeseg_ros.core.arrays import Floats, Mask
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.stairs import RISE
-from rangeseg_ros.core.significance import CLEARLY
 
 ROLES = ('other', 'floor', 'ceiling', 'wall', 'table', 'ramp', 'step', 'lower')
 """All roles; their indices are their numbers in messages."""
@@ -71,7 +70,7 @@ def roles(planes: Sequence[Plane], config: Config, up: ArrayLike | None = None) 
         slope = np.degrees(np.arccos(np.clip(normal @ floor.normal, -1, 1)))
         ramp = (slope > 2 * config.up_sd) & (slope <= config.ground_slope)
         for k in map(int, np.flatnonzero(ramp)):
-            off = np.abs(corners_of(planes[k]) @ floor.normal + floor.distance)
+            off = np.abs(planes[k].corners @ floor.normal + floor.distance)
             if off.min() <= config.role_height:
                 found[k] = 'ramp'
     return [str(role) for role in found]
@@ -97,9 +96,8 @@ def _floor(candidates: list[Plane], up: Floats, config: Config) -> Plane | None:
         return nearest if nearest and off(nearest) <= config.role_height else None
 
     def reach(plane: Plane) -> float:
-        corners = corners_of(plane)
-        depth = -corners @ up
-        across = np.linalg.norm(corners + depth[:, None] * up, axis=1)
+        depth = -plane.corners @ up
+        across = np.linalg.norm(plane.corners + depth[:, None] * up, axis=1)
         return float((across / np.maximum(depth, 1e-3)).min())
 
     return min(candidates, key=reach, default=None)
@@ -114,14 +112,6 @@ def _largest(planes: Sequence[Plane], chosen: Mask) -> list[Plane]:
 def _offsets(planes: Sequence[Plane], level: Plane) -> Floats:
     """(N,) distance of the planes' centroids from a plane, metres, positive towards the sensor."""
     return np.array([plane.centroid for plane in planes]) @ level.normal + level.distance
-
-
-def corners_of(plane: Plane) -> Floats:
-    """(4, 3) corners of the rectangle around a plane."""
-    axes = plane.shape.frame[:, :2]
-    half = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) * plane.extents / 2
-    corners: Floats = plane.centre + half @ axes.T
-    return corners
 
 
 class Ramp(NamedTuple):
@@ -152,55 +142,3 @@ def ramps_of(planes: Sequence[Plane], up: Floats) -> list[Ramp]:
             slope = float(np.degrees(np.arctan2(length, rise)))
             found.append(Ramp(plane.id, slope, plane.centroid, along / length))
     return found
-
-
-class Tilt(NamedTuple):
-    """A camera that stands otherwise than is said, by the up (3,) of the planes."""
-
-    degrees: float
-    up: Floats
-
-    def __str__(self) -> str:
-        """What to do about it, in one line."""
-        x, y, z = (f'{part:.3f}' for part in self.up)
-        return (
-            f'up as stated, or of a level camera, is off by {self.degrees:.0f} degrees, so that '
-            f'roles and terrain are unreliable; the planes say up_x: {x}, up_y: {y}, up_z: {z}'
-        )
-
-
-def tilt_of(
-    planes: Sequence[Plane], up: Floats, tolerance: float, area: float, slope: float
-) -> Tilt | None:
-    """The tilt that the planes show; None where they agree with `up`, or do not tell.
-
-    Most of what is built is level or vertical, within `tolerance` degrees: the normal that most of
-    the planes agree with is up, of planes of at least `area` square metres. A ramp of up to
-    `slope` degrees may fill the view.
-    """
-    normals = np.array([plane.normal for plane in planes]).reshape(-1, 3)
-    pixels = np.array([plane.count for plane in planes], np.float64)
-    steep = np.degrees(np.arccos(np.clip(normals @ up, -1, 1)))
-    stated = _agree(normals, up, tolerance)
-    found: list[tuple[float, int]] = []
-    # Only what may be a floor tells: a lone slanted wall or ceiling stands in many rooms. What
-    # leans by more than 45 degrees is nearer to a wall.
-    for k in map(int, np.flatnonzero((steep > max(tolerance, slope)) & (steep <= 45))):
-        seen = _agree(normals, normals[k], tolerance)
-        # Walls that the camera would turn about agree with both.
-        alone = pixels[seen & ~stated].sum(), pixels[stated & ~seen].sum()
-        whole = 2 * pixels[seen].sum() >= pixels.sum()  # most of what is seen
-        # The area last: it is worked out when asked for.
-        if whole and alone[0] > CLEARLY * alone[1] and planes[k].area >= area:
-            found.append((float(alone[0]), k))
-    if not found:
-        return None
-    floor = max(found)[1]
-    return Tilt(float(steep[floor]), normals[floor].astype(np.float64))
-
-
-def _agree(normals: Floats, up: Floats, tolerance: float) -> Mask:
-    """Which planes are level or vertical by a direction, within `tolerance` degrees."""
-    rise = np.degrees(np.arcsin(np.clip(np.abs(normals @ up), 0, 1)))
-    result: Mask = (rise <= tolerance) | (rise >= 90 - tolerance)
-    return result

@@ -22,8 +22,8 @@ class Survey:
     `up` (3,) is a unit vector in the frame of the image, `sensor_height` that above the ground
     below the sensor, metres, 0 for unknown. `memory` is of the images before the one of `stamp`,
     nanoseconds; `pose` (rotation, shift) leads from the frame of the image, with the sensor as its
-    origin, to the frame named `fixed_frame`. `cells` are those of one
-    measurement each where the image was enlarged; the errors are theirs.
+    origin, to the frame named `fixed_frame`. `cells` hold a measurement each where the image was
+    enlarged; the errors are theirs.
     """
 
     image: RangeImage
@@ -50,9 +50,8 @@ class Survey:
             remembered = self.memory.recall_height(self.stamp)
             # A robot nods and a floor undulates, by less than an obstacle is high.
             known = (remembered, self.config.least_step) if remembered else (0.0, 0.0)
-        image, cells = self.image, self.cells
-        if cells is not None:
-            image = cells.reduced(image)
+        cells = self.cells
+        image = self.image if cells is None else cells.reduced(self.image)
         found = terrain_of(image, self.sensor, self.up, known, self.config)
         if cells is not None:
             pixels = [cells.enlarged(values, self.image.shape) for values in found[:2]]

@@ -122,12 +122,12 @@ def _upright(
     turned: bool,
 ) -> Terrain:
     """The same for an image whose columns are along up; `turned` where up is down in it."""
-    cells = cells_of(image, up, sensor)
+    cells = cells_of(image, up, sensor, turned)
     place = cells.place.astype(np.float64)
     height, height_sd = known
-    height = height or _nearest(place[0, :: 1 if turned else -1])
+    height = height or _nearest(place[0])
     place[0] += height
-    reached = reach(place, cells.variance, config, turned)
+    reached = reach(place, cells.variance, config)
     seen = None
     if reached.any():
         seen = continued(place[:, reached], cells.variance[reached], height_sd, config)
@@ -147,7 +147,7 @@ def _upright(
     a, b, c = seen.plane
     lean = np.array([b, c]) @ cells.axes[1:]
     stand = Stand(-(up - lean) / (height - a), seen.confidence)
-    return _with_ground(image, cells, reached, stand, config, turned)
+    return _with_ground(image, cells, reached, stand, config)
 
 
 def _nearest(above: Floats) -> float:
@@ -168,7 +168,7 @@ def _contradiction(height: float, seen: Continuation | None) -> str:
 
 
 def _with_ground(
-    image: RangeImage, cells: Cells, reached: Mask, stand: Stand, config: Config, turned: bool
+    image: RangeImage, cells: Cells, reached: Mask, stand: Stand, config: Config
 ) -> Terrain:
     """Classes and heights by the ground that was reached, continued."""
     field = ground_field(cells, reached, stand.theta)
@@ -190,7 +190,7 @@ def _with_ground(
     near = np.where(reached, np.clip(noise, least, config.least_step), np.where(beside, least, -1))
     lowest = -np.maximum(share * config.drop_height, sure)
     highest = np.maximum(share * config.obstacle_height, sure)
-    classes, heights = classify(image, field, np.stack([near, lowest, highest], dtype=np.float32))
+    bounds = np.stack([near, lowest, highest], dtype=np.float32)
     kind = np.where(reached & np.isfinite(height), GROUND, UNKNOWN).astype(np.int8)
     kind[height > highest] = OBSTACLE
     kind[height < lowest] = DROP
@@ -198,11 +198,9 @@ def _with_ground(
     share = np.float32(1) + height * np.tensordot(cells.axes[0].astype(np.float32), field.theta, 1)
     share[share <= 0] = np.nan
     crossing = cells.place[1:] / share
-    order = slice(None, None, 1 if turned else -1)
-    below = CellTerrain(
-        cells.place[:, order], height[order], kind[order], cells.error[order], crossing[:, order]
-    )
-    return Terrain(classes, heights, stand, field, below)
+    below = CellTerrain(cells.place, height, kind, cells.error, crossing)
+    field = field._replace(theta=np.ascontiguousarray(field.theta[:, cells.order]))
+    return Terrain(*classify(image, field, bounds[:, cells.order]), stand, field, below)
 
 
 def _without_ground(
@@ -223,7 +221,7 @@ def _without_ground(
         error = height_sd + np.radians(config.up_sd) * distance
         bound = config.obstacle_height + apart + _CERTAIN * error
         obstacle |= cells.place[0] + height > bound
-    wide = cells.size.enlarged(obstacle, image.shape)
+    wide = cells.size.enlarged(obstacle[cells.order], image.shape)
     classes = np.where(image.valid & wide, OBSTACLE, UNKNOWN).astype(np.uint8)
     nowhere = GroundField(np.zeros((3, *obstacle.shape), np.float32), cells.size, cells.axes[0])
     return Terrain(classes, np.full(image.shape, np.nan, np.float32), stand, nowhere)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.arrays import Floats, Indices, Labels, Mask
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.ground.roles import corners_of
 from rangeseg_ros.core.mapping.map_planes import MapPlane, Record, describe
 from rangeseg_ros.core.mapping.observations import (
     Observations,
@@ -224,7 +223,7 @@ class PlaneMap:
         for plane, k in zip(planes, match.tolist(), strict=True):
             parts.setdefault(k, []).append(plane)
         for k, some in parts.items():
-            corners = np.concatenate([corners_of(part) for part in some])
+            corners = np.concatenate([part.corners for part in some])
             grids[k].reach(known.where([k]).coordinates(corners))
         # Through a lens, or in a cloud, no homography leads from cells to pixels.
         pinhole = camera if camera and not camera.distortion_model else None
