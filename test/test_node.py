@@ -59,7 +59,8 @@ def test_other_inputs(node, expected, source):
     if source == 'points':
         topic, kind, least = '/depth/points', PointCloud2, 0.99  # rounding decides at the crease
         points = RangeImage.from_depth(depth, node.camera).points.reshape(-1, 3)
-        message = points_message(make_rclpy, node.header(), points.astype(np.float32))
+        points = np.pad(points.astype(np.float32), ((0, 0), (0, 1)))
+        message = points_message(make_rclpy, node.header(), points)
         message.height, message.width = depth.shape
         message.row_step = message.width * message.point_step
     else:

@@ -33,7 +33,7 @@ UP = (0, -np.cos(np.radians(30)), -np.sin(np.radians(30)))
 def known(pairs=()):
     def lookup(target, source):
         if (target, source) not in pairs:
-            raise TransformError(f'frame {target!r} is not known', may_come=True)
+            raise TransformError(f'frame {target!r} is not known', ': 1 s late', True)
         return pairs[target, source]
 
     return lookup
@@ -65,6 +65,7 @@ def test_without_it_the_accelerometer_tells_up_and_then_the_parameters():
     found = find_placement(Config(), 'camera', known(), ('elsewhere', np.ones(3)))
     assert not found.ups and not found.may_come
     assert found.sources['up'].startswith('the parameters up_x, up_y, up_z; no imu in elsewhere')
+    assert 'late' in found.sources['up'] and 'late' not in found.missing['up']
 
 
 def test_planes_of_a_camera_elsewhere_are_those_planes_moved():
@@ -95,6 +96,8 @@ def test_the_height_counts_where_the_parameter_does_not(parameter, expected):
     image = RangeImage.from_depth(np.ones(CAMERA.shape, np.float32), CAMERA)
     sequence = SequenceSegmenter(Config(sensor_height=parameter))
     assert sequence.segment(image, 0, UP, height=1.0).survey.sensor_height == expected
+    with pytest.raises(ValueError, match='finite'):
+        sequence.segment(image, 0, UP, height=np.nan)
 
 
 def test_the_last_up_is_held_while_a_slope_can_be_told_from_level_ground():

@@ -95,6 +95,8 @@ def test_time_0_is_the_last_that_all_of_the_chain_knows():
     # What is above both does not count.
     found = buffer.lookup('odom', 'camera', 0)
     np.testing.assert_allclose(found.rotation, fast.matrix(3.98)[:3, :3], atol=1e-9)
+    buffer.insert('dock', 'shelf', 0, (0, 0, 0, 1), (0, 0, 1))
+    assert buffer.lookup('dock', 'shelf', 0).shift[2] == 1
 
 
 def test_errors_in_words():

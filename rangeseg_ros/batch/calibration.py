@@ -28,6 +28,8 @@ from rangeseg_ros.io.images import read_depth
 
 PART = 10
 """Frames that one process takes at a time: what an interruption costs it."""
+# Files that folders of bags hold, of which one that was cut off lacks the first.
+_OF_BAGS = ('metadata.yaml', '*.mcap', '*.db3')
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class Source:
     @property
     def is_folder(self) -> bool:
         """Whether it is a folder of images."""
-        return self.path.is_dir() and not any(self.path.glob('metadata.yaml'))
+        return self.path.is_dir() and not any(any(self.path.glob(name)) for name in _OF_BAGS)
 
     def files(self) -> list[Path]:
         """Images of a folder in the order of their names."""

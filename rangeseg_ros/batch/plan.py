@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -53,7 +53,7 @@ class _Stretch:
 
     `frames` are the numbers of its frames, `heights` of the sensor in them, metres, NaN where not
     known; `stairs` that they show, with their places among the frames; `looked` and `told` sums
-    of the directions of up in the images, by the parameters and by the sensors.
+    of the directions of up in the images, by the parameters and by `gravity_frame`.
     """
 
     map: PlaneMap
@@ -122,8 +122,7 @@ class PlanTask:
         points = self._points(best.frames, solution, config)
         up = estimate_up(solution.planes, best.looked, np.radians(config.role_tolerance))
         if best.told.any():
-            source = config.gravity_frame or 'the accelerometer'
-            up = Up(best.told / np.linalg.norm(best.told), 0.0, source)
+            up = Up(best.told / np.linalg.norm(best.told), 0.0, config.gravity_frame)
         grid = self.headroom, self.resolution
         stairs = [(each, solution.poses[k]) for each, k in best.stairs]
         heights = np.array(best.heights)[:, None] * up.direction
@@ -185,7 +184,5 @@ class PlanTask:
                     points = points_within(image, sensor, self.resolution) - image.place
                     yield pose.apply(points)
 
-    @contextmanager
-    def _open(self) -> Iterator[DepthBag]:
-        with DepthBag(self.recording, self.depth_topic, self.camera_topic) as source:
-            yield source
+    def _open(self) -> DepthBag:
+        return DepthBag(self.recording, self.depth_topic, self.camera_topic)

@@ -29,7 +29,7 @@ from rangeseg_ros.io import tables
 from rangeseg_ros.io.bags import DamagedBagError, DepthBag
 from rangeseg_ros.io.corrections import corrected, correction_files
 from rangeseg_ros.io.meshes import write_mesh
-from rangeseg_ros.io.poses import write_trajectory
+from rangeseg_ros.io.poses import seconds_of, write_trajectory
 from rangeseg_ros.io.recordings import BagError
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.report.replay import ReplayReport
@@ -170,7 +170,7 @@ class _Results:
             yield from self.bag.messages(frame, image, result, target, sequence.motion)
 
     def _write(self, index: int, stamp: int, image: RangeImage, result: Segmentation) -> None:
-        leading = [str(index), '{}.{:09d}'.format(*divmod(stamp, 10**9))]
+        leading = [str(index), seconds_of(stamp)]
         kinds = PICTURES + TERRAIN if self.replay.terrain else PICTURES
         stem = f'{index:06d}_{leading[1]}'
         files = write_frame(self.folder, stem, image, result, kinds)
@@ -228,7 +228,7 @@ class _Results:
 def segment_frames(
     source: DepthBag,
     sequence: SequenceSegmenter,
-    place: Callable[[DepthFrame, Motion | None], Placement] = lambda *_: Placement(),
+    place: Callable[[DepthFrame, Motion | None], Placement],
     progress: Progress | None = None,
 ) -> Iterator[tuple[int, DepthFrame, RangeImage, Segmentation]]:
     """Segment the frames of a recording, with persistent ids and roles; `place` locates them.

@@ -112,12 +112,15 @@ class SequenceSegmenter:
         Raises
         ------
         ValueError
-            A stamp that is no integer, a pose that is no Transform, or as `Segmenter.segment`.
+            A stamp that is no integer, a pose that is no Transform, a height that is not finite,
+            or as `Segmenter.segment`.
         """
         if not isinstance(stamp, int | np.integer):
             raise ValueError(f'stamp must be an integer, nanoseconds, not {stamp!r:.60}')
         if not isinstance(pose, Transform | None):
             raise TransformError('pose must be a Transform, as of Transform.from_matrix(matrix)')
+        if height is not None and not np.isfinite(height):
+            raise ValueError(f'height must be a finite number, metres, not {height!r:.60}')
         result = result or self._segmenter.segment(image)
         config = self.config
         if up_sd not in (None, config.up_sd):
@@ -153,7 +156,7 @@ class SequenceSegmenter:
             self.map.add(result.labels, planes, image, pose, stamp)
         survey = result.survey
         if isinstance(survey, Survey) and up is not None:
-            above = 0.0 if height is None else max(float(height + up @ image.place), 0.0)
+            above = 0.0 if height is None else max(0.0, float(height + up @ image.place))
             survey = replace(
                 survey,
                 config=config,

@@ -92,11 +92,11 @@ class DepthBagWriter:
         name = 'image_rect' if camera.pinhole else 'image_raw'
         self._append(f'/depth/{name}', IMAGE, stamp, image)
 
-    def write_pose(self, pose: Transform, stamp: int, parent: str = 'world') -> None:
-        """Append to /tf where the camera is in `parent` at `stamp` nanoseconds."""
+    def write_pose(self, pose: Transform, stamp: int) -> None:
+        """Append to /tf where the camera is in `world` at `stamp` nanoseconds."""
         transform = make_rosbags(
             'geometry_msgs/msg/TransformStamped',
-            header=header_of(make_rosbags, stamp, parent),
+            header=header_of(make_rosbags, stamp, 'world'),
             child_frame_id=self._frame_id,
             transform=make_rosbags(
                 'geometry_msgs/msg/Transform',

@@ -131,9 +131,9 @@ class DepthBag(Closing):
     def _first(self, topic: str, made: Callable[[Any], T], items: Iterable[Any] = ()) -> T:
         """What is made of the first item, or message on a topic, of which it can be."""
         reason = f'no message on {topic}'
+        self.lost.clear()
         try:
-            messages = (message for *_, message in self._recording.messages((topic,)))
-            for item in items or messages:
+            for item in items or (m for *_, m in self._recording.messages((topic,))):
                 if isinstance(item, Lost):
                     self.lose(item.reason)
                     continue

@@ -79,13 +79,13 @@ def _data(calibration: Mapping[str, Any], key: str) -> Any:
     return entry['data']
 
 
-def write_camera(path: Path, camera: Camera, name: str = 'depth') -> None:
+def write_camera(path: Path, camera: Camera) -> None:
     """Write a ROS camera-calibration YAML file: without P unless the camera is a pinhole."""
     d = list(camera.d or (0.0,) * 5)
     calibration: dict[str, Any] = {
         'image_width': camera.width,
         'image_height': camera.height,
-        'camera_name': name,
+        'camera_name': 'depth',
         'camera_matrix': {'rows': 3, 'cols': 3, 'data': camera.matrix.ravel().tolist()},
         'distortion_model': camera.distortion_model or 'plumb_bob',
         'distortion_coefficients': {'rows': 1, 'cols': len(d), 'data': d},

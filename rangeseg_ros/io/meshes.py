@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from rangeseg_ros.core.mapping.plane_map import MapPlane
+from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.io.files import replacing
 

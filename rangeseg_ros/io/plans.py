@@ -189,11 +189,8 @@ def _write_glb(path: Path, plan: FloorPlan) -> None:
     path.write_bytes(scene.export(file_type='glb'))
 
 
-def write_plan(folder: Path, plan: FloorPlan) -> list[Path]:
+def write_plan(folder: Path, plan: FloorPlan) -> None:
     """Write all files of a plan into a folder, each whole or not at all."""
-    written = []
     for name, write in plan_files().items():
         with replacing(folder / name) as partial:
             write(partial, plan)
-        written.append(folder / name)
-    return written

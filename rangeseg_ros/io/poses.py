@@ -58,6 +58,12 @@ def _number(path: Path) -> int | None:
     return int(numbers[-1]) if numbers else None
 
 
+def seconds_of(stamp: int) -> str:
+    """A time, nanoseconds, in decimal seconds."""
+    seconds, rest = divmod(abs(stamp), 10**9)
+    return f'{"-" * (stamp < 0)}{seconds}.{rest:09d}'
+
+
 def write_trajectory(path: Path, poses: Sequence[tuple[int, Transform]]) -> None:
     """Write stamps (nanoseconds) and poses as the TUM RGB-D benchmark has them.
 
@@ -66,6 +72,6 @@ def write_trajectory(path: Path, poses: Sequence[tuple[int, Transform]]) -> None
     lines = ['# timestamp tx ty tz qx qy qz qw']
     for stamp, pose in poses:
         numbers = ' '.join(f'{x:.9g}' for x in (*pose.shift, *quaternions(pose.rotation)))
-        lines.append(f'{stamp // 10**9}.{stamp % 10**9:09d} {numbers}')
+        lines.append(f'{seconds_of(stamp)} {numbers}')
     with replacing(path) as partial:
         partial.write_text('\n'.join([*lines, '']))

@@ -150,9 +150,8 @@ def thinned(points: Singles, resolution: float, most: int = MOST_POINTS) -> Sing
 
 
 def points_message(make: Make, header: Any, points: Singles) -> Any:
-    """sensor_msgs/PointCloud2 of points (N, 3), metres, or (N, 4) with their height."""
-    kind = POINT_TYPE if points.shape[1] == 3 else _HEIGHT_TYPE
-    return cloud_message(make, header, unstructured_to_structured(points, kind))
+    """sensor_msgs/PointCloud2 of points (N, 4) with their height, metres."""
+    return cloud_message(make, header, unstructured_to_structured(points, _HEIGHT_TYPE))
 
 
 def stairs_message(make: Make, header: Any, stairs: Sequence[Stairs]) -> Any:

@@ -108,8 +108,9 @@ def find_placement(
             upwards = measured / np.linalg.norm(measured)
             found.ups.append(Up(upwards, sd, f'imu in {acceleration[0]}'))
         else:
-            found.missing['up'] = why = f'imu in {acceleration[0]}: {found.sources["up"]}'
-            tried.append(f'no {why}')
+            imu = f'imu in {acceleration[0]}'
+            found.missing['up'] = f'{imu}: {found.missing["up"]}'
+            tried.append(f'no {imu}: {found.sources["up"]}')
     names = ' and '.join(up.source for up in found.ups)
     found.sources['up'] = '; '.join([names or PARAMETERS, *tried])
     return found

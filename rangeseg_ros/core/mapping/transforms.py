@@ -180,7 +180,7 @@ class TransformBuffer:
             detail = f'frames {target!r} and {source!r} are not connected'
             raise up_ends or down_ends or TransformError(detail, may_come=True)
         (first, known), (second, also_known) = up[common], down[common]
-        if not stamp and min(known, also_known) < np.inf:
+        if not stamp and 0 < min(known, also_known) < np.inf:
             return self.lookup(target, source, int(min(known, also_known)))
         return second.inverse().after(first)
 
