@@ -74,14 +74,12 @@ def test_a_jump_mixes_no_two_surfaces():
     """But in bins of one surface nothing is left out, however steep that is."""
     columns = np.arange(CAMERA.width)
     for edge in (200, 201):
-        inverse = np.where(columns < edge, 0.5, 0.25) * np.ones(CAMERA.shape)
-        bins = Bins.of(image_of(inverse), 2)
+        bins = Bins.of(image_of(np.where(columns < edge, 0.5, 0.25) * np.ones(CAMERA.shape)), 2)
         found = bins.of_one_surface(np.full((60, 80), 0.01, np.float32)).inverse
         assert set(np.unique(found)) == {np.float32(0.5), np.float32(0.25)}
         # Of two that are as large, the nearer one.
         assert (found[:, 100] == (0.5 if edge == 201 else 0.25)).all()
-    steep = image_of(np.maximum(CAMERA.rays @ [0.0, 0.7, 0.01], 0))
-    bins = Bins.of(steep, 2)
+    bins = Bins.of(image_of(np.maximum(CAMERA.rays @ [0.0, 0.7, 0.01], 0)), 2)
     found = bins.of_one_surface(np.full((60, 80), 1e-4, np.float32)).inverse
     near = bins.means.inverse > 0.1  # seen at more than five degrees
     np.testing.assert_array_equal(found[near], bins.means.inverse[near])

@@ -70,6 +70,7 @@ def test_binned_regions_have_the_rays_of_the_pixels_they_collect(region):
         ({'fx': 1e-300}, 'do not fit 4x3 pixels'),
         ({'cx': 1e300}, 'do not fit'),
         ({'skew': np.nan}, 'skew'),
+        ({'turn': None}, 'turn'),
     ],
 )
 def test_impossible_intrinsics(change, message):

@@ -128,8 +128,9 @@ def test_no_link_joins_an_object_and_what_is_behind(detector, heights, shadow, s
         dark = np.any(moved, axis=0) & ~front
         for height, slope in product(heights, (0, 0.0009)):
             image = image_of((ramp(slope) + height * front) * ~dark)
-            grid = grid_of(image, jump_edges.jump_edges(image, detector, STEP))
-            found = parts([links == 0 for links in grid])
+            jumps = jump_edges.jump_edges(image, detector, STEP)
+            assert image.valid[jump_edges.pixels_beside(jumps)].all()
+            found = parts([links == 0 for links in grid_of(image, jumps)])
             both = np.intersect1d(found[front], found[~front & ~dark])
             assert not both.size, (angle, height, slope)
 

@@ -7,7 +7,7 @@ import pytest
 
 from rangeseg_ros import Camera, Config, RangeImage
 from rangeseg_ros.core.by_normals.directions import directions
-from rangeseg_ros.core.by_normals.labelling import minimise
+from rangeseg_ros.core.by_normals.labelling import _largest_parts, minimise
 from rangeseg_ros.core.by_normals.normals import cross_product, observed_normals, plane_fit
 from rangeseg_ros.core.sensing.grid import Grid
 
@@ -94,3 +94,8 @@ def test_labels_of_a_single_row_grow_over_its_only_edge():
     known, labels = directions(73).astype(np.float32), np.repeat([5, 9], 20)[None]
     grid = Grid(np.ones((1, 39), bool), np.ones((0, 40), bool))
     np.testing.assert_array_equal(minimise(known[labels], known, grid, 40.0), labels)
+
+
+def test_of_parts_as_large_a_square_has_one():
+    grid = Grid(np.tile(np.arange(7) != 3, (8, 1)), np.ones((7, 8), bool))
+    assert np.count_nonzero(_largest_parts(grid)) == 32

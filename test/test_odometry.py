@@ -66,8 +66,7 @@ def errors_of(motion, truth):
 def test_walks_are_followed_and_the_error_is_known():
     values, errors = [], []
     for seed in range(4):
-        scene = kinect_room(seed, 33, walk)
-        motions, truths = followed(scene, range(0, 33, STEP), seed)
+        motions, truths = followed(kinect_room(seed, 33, walk), range(0, 33, STEP), seed)
         error = errors_of(motions[-1], truths[-1])
         values.append(error @ np.linalg.solve(motions[-1].covariance, error) / 6)
         errors.append(np.linalg.norm(error.reshape(2, 3), axis=1))

@@ -97,9 +97,8 @@ def expand(alpha, labels, cost, problem, models, reach=12):
     labelling = GridLabelling.of(labels, cost, problem.links, problem.width)
     start, sites = fronts(labelling, len(models.theta), rows)
     front = sites[start[alpha] : start[alpha + 1]]
-    helped = refinement._expand(alpha, front, rows, reach, labelling, problem, models)
+    refinement._expand(alpha, front, rows, reach, labelling, problem, models)
     assert (labelling.position == -1).all()
-    return helped
 
 
 def linked(problem, label, labels):
@@ -132,7 +131,7 @@ def test_an_expansion_is_the_best_there_is(seed):
     every[:, free] = np.where(chosen, 1, every[:, free])
     least = energies(every.reshape(-1, 3, 4), problem, models).min()
     before = labels.copy()
-    assert expand(1, labels, cost, problem, models) == (labels != before).any()
+    expand(1, labels, cost, problem, models)
     (reached,) = energies(labels[None], problem, models)
     assert reached == pytest.approx(least, abs=1e-4)
     assert energy_of(labels, problem, models) == pytest.approx(reached, rel=1e-5)

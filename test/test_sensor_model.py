@@ -120,8 +120,7 @@ def test_a_few_blocks_tell_no_kind_of_error(count, told, like):
     draw = np.random.default_rng(5)
     for _ in range(100):
         squared, none = draw.uniform(0.04, 4, (1, count)), np.zeros((1, count))
-        blocks = Blocks(none, squared, none, none)
-        strata = Strata.of(blocks, np.arange(count))
+        strata = Strata.of(Blocks(none, squared, none, none), np.arange(count))
         shown = strata.medians(1e-6 * squared**2 * draw.uniform(0.5, 2, count))
         law = fit_law(strata, shown, np.zeros(len(shown)), like)
         in_range = told or like.quartic > 0
@@ -146,8 +145,7 @@ def test_waves_of_the_range_are_distortion_however_far_a_surface_is(waves, far):
 
 def test_strata_are_ranges_of_equal_size_and_slopes_in_them():
     squared, slope = np.random.default_rng(6).integers(0, 50, (2, 30, 40)).astype(float)
-    blocks = Blocks(slope, squared, slope, slope)
-    strata = Strata.of(blocks, np.arange(3, 1200))
+    strata = Strata.of(Blocks(slope, squared, slope, slope), np.arange(3, 1200))
     assert strata.blocks.shape == (24, 49) and len(np.unique(strata.blocks)) == strata.blocks.size
     ranges, slopes = (key.ravel()[strata.blocks] for key in (squared, slope))
     for parts in (ranges.reshape(1, 8, -1), slopes.reshape(8, 3, -1)):
@@ -212,8 +210,7 @@ def test_whatever_the_image_the_model_is_finite(seed, holes, scale):
     inverse = scale * random.random((60, 80))
     inverse[random.random(inverse.shape) < holes] = 0
     camera = Camera(80, 60, 70.0, 70.0, 39.5, 29.5)
-    image = RangeImage(camera.rays, inverse.astype(np.float32), camera)
-    scales = nested(image)
+    scales = nested(RangeImage(camera.rays, inverse.astype(np.float32), camera))
     sensor = measured_sensor(scales, STATED, (0.0, 0.0))
     assert np.isfinite(sensor).all() and min(sensor) >= 0 and sensor.white <= 1
     steps = jump_steps(scales[0], sensor)
@@ -281,7 +278,7 @@ def test_a_patch_is_what_the_mean_of_four_pixels_keeps_of_the_noise(white, width
 def test_what_is_said_of_the_errors():
     stereo = SensorModel(0.0034, 0.0, 0.1, 9 / (2 * np.sqrt(np.pi)), 0.005, 0.0, 35.0)
     assert str(stereo) == 'noise 0.0034 1/m, correlated over 9 px, distortion 0.005 1/m'
-    assert str(stereo._replace(quantum=0.001)) == f'{stereo}, steps of 0.001 1/m'
+    assert str(stereo._replace(noise=0.0, quantum=0.1)) == 'distortion 0.005 1/m, steps of 0.1 1/m'
     laser = SensorModel(0.0, 0.012, 1.0, 0.0, 0.0, 0.0, 35.0, range_quantum=0.001)
     assert str(laser) == 'range noise 0.012 m, steps of 0.001 m'
 

@@ -73,8 +73,7 @@ def test_rays_pass_through_what_is_before_their_ends_in_any_frame_of_the_camera(
 
 
 def test_cells_are_seen_where_pixels_of_the_plane_look_at_them():
-    random = np.random.default_rng(3)
-    labels = random.integers(1, 4, CAMERA.shape).astype(np.uint16)
+    labels = np.random.default_rng(3).integers(1, 4, CAMERA.shape).astype(np.uint16)
     grid = PlaneGrid(0.07)
     grid.add(grid.fill([[np.array([[-3.0, -2], [3, -2], [3, 2], [-3, 2]])]]), HIT)
     normal = Rotation.from_rotvec([0.4, -0.3, 0.2]).apply([[0, 0, -1]])

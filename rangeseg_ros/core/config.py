@@ -258,20 +258,20 @@ def _check_names(kind: type[Config], names: Iterable[object]) -> None:
 
 
 # Former names of parameters, and their names now.
-RENAMED = {'sensor_height_noise': 'sensor_height_sd', 'up_noise': 'up_sd'}
+_RENAMED = {'sensor_height_noise': 'sensor_height_sd', 'up_noise': 'up_sd'}
 # Former parameters that nothing reads any more; CHANGELOG.rst has the reasons.
-DROPPED = ['directions', 'cycles', 'flatness', 'noise_regions', 'moves', 'refits']
-DROPPED += ['track_memory', 'warm_start']
+_DROPPED = ['directions', 'cycles', 'flatness', 'noise_regions', 'moves', 'refits']
+_DROPPED += ['track_memory', 'warm_start']
 
-NAMES = frozenset((*RENAMED, *DROPPED, *Config.__dataclass_fields__))
+NAMES = frozenset((*_RENAMED, *_DROPPED, *Config.__dataclass_fields__))
 """What parameters are, or were, called."""
 
 
 def _renamed(mapping: Mapping[str, Any]) -> dict[str, Any]:
     """Names and values of parameters as they are called now."""
-    result = {name: value for name, value in mapping.items() if name not in (*RENAMED, *DROPPED)}
-    said = [f'{name} is not read any more (CHANGELOG.rst)' for name in DROPPED if name in mapping]
-    for former, name in RENAMED.items():
+    result = {name: value for name, value in mapping.items() if name not in (*_RENAMED, *_DROPPED)}
+    said = [f'{name} is not read any more (CHANGELOG.rst)' for name in _DROPPED if name in mapping]
+    for former, name in _RENAMED.items():
         if former in mapping:
             result.setdefault(name, mapping[former])
             said.append(f'{former} is called {name} now: {name}: {result[name]!r}')

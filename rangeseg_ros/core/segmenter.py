@@ -223,9 +223,8 @@ def _preprocessed(
     jumps = jump_edges(whole, config.jump_edges, steps.windows, steps.slopes, steps.pixels)
     grid = grid_of(whole, jumps)
     watch.lap('edges')
-    view = View(image, whole, blocks.result(), grid, sensor, least, bins.area, identified)
-    if nodes:
-        view = view._replace(nodes=nodes.result())
+    known = blocks.result(), grid, sensor, least, bins.area, identified
+    view = View(image, whole, *known, nodes.result() if nodes else None)
     return view, sensor.of_pixels(side, excess), jumps
 
 

@@ -32,10 +32,12 @@ from rangeseg_ros.core.graphcut.expansion import (
 )
 from rangeseg_ros.core.regions import connected_components
 from rangeseg_ros.core.runtime.threads import run_halves
+from rangeseg_ros.core.sensing.enlargement import Cells
 from rangeseg_ros.core.sensing.grid import Grid
 
 # Pixels along a side of a square, 4800 squares in VGA, and sites from a border to expand it to.
 _SIZE = 8
+_SQUARES = Cells(_SIZE, 0, 0)
 
 
 def minimise(normals: Singles, directions: Singles, grid: Grid, smoothness: float) -> Ints:
@@ -49,7 +51,7 @@ def minimise(normals: Singles, directions: Singles, grid: Grid, smoothness: floa
     squares = _nearest(known, directions, _SIZE)
     for _ in range(2):
         _expand(squares, _SIZE, _between_squares(links, inside), known, directions)
-    labels = _enlarged(squares, _SIZE, (height, width))
+    labels = _SQUARES.enlarged(squares, (height, width)).copy()
     _expand(labels, 1, links, normals, directions)
     return labels
 
@@ -95,11 +97,11 @@ def _largest_parts(grid: Grid) -> Mask:
     """Pixels (H, W) in the largest connected part of their square."""
     shape = len(grid.right), grid.below.shape[1]
     rows, columns = (-(-length // _SIZE) for length in shape)
-    squares = _enlarged(np.arange(rows * columns).reshape(rows, columns), _SIZE, shape)
+    squares = _SQUARES.enlarged(np.arange(rows * columns).reshape(rows, columns), shape)
     parts = connected_components(squares, grid, np.ones(shape, np.bool_))
-    area = np.bincount(parts.ravel())[parts]
-    largest = _enlarged(_per_square(np.maximum, area, _SIZE), _SIZE, shape)
-    inside: Mask = area == largest
+    # By size; of parts as large, the last one.
+    rank = np.bincount(parts.ravel())[parts] * (parts.max() + 1) + parts
+    inside: Mask = rank == _SQUARES.enlarged(_per_square(np.maximum, rank, _SIZE), shape)
     return inside
 
 
@@ -117,11 +119,6 @@ def _per_square(function: np.ufunc, values: NDArray[Any], size: int) -> NDArray[
     for axis in (0, 1):
         values = function.reduceat(values, np.arange(0, values.shape[axis], size), axis=axis)
     return values
-
-
-def _enlarged(squares: NDArray[Any], size: int, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Values (h, w) of the squares for their pixels (H, W)."""
-    return squares.repeat(size, axis=0).repeat(size, axis=1)[: shape[0], : shape[1]].copy()
 
 
 def _expand(

@@ -8,12 +8,8 @@ import numpy as np
 from rangeseg_ros.core.arrays import Floats, Mask, Singles
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.grid import Grid
-from rangeseg_ros.core.sensing.moments import cofactors
+from rangeseg_ros.core.sensing.moments import COLUMNS, ROWS, SYMMETRIC, cofactors
 from rangeseg_ros.core.sensing.range_image import RangeImage
-
-# Rows and columns of the six entries of a symmetric matrix, and the matrix made of them.
-_ROWS, _COLUMNS = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
-_SYMMETRIC = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
 
 
 def observed_normals(image: RangeImage, grid: Grid, config: Config) -> Singles:
@@ -32,7 +28,7 @@ def observed_normals(image: RangeImage, grid: Grid, config: Config) -> Singles:
     return normals
 
 
-def cross_product(image: RangeImage, baseline: int = 1) -> Singles:
+def cross_product(image: RangeImage, baseline: int) -> Singles:
     """Cross product of the tangents between the neighbours of a pixel (thesis 5.7.1).
 
     Between those so many pixels to the left and right, above and below, which must be measured; 1
@@ -50,7 +46,7 @@ def cross_product(image: RangeImage, baseline: int = 1) -> Singles:
     return _towards_sensor(np.stack([x, y, z], axis=-1), image)
 
 
-def plane_fit(image: RangeImage, radius: int = 2) -> Singles:
+def plane_fit(image: RangeImage, radius: int) -> Singles:
     """Plane of least squares in inverse range through 2 radius + 1 rows and columns (5.7.2).
 
     That is where the noise of structured light and stereo is constant. The plane n . p + d = 0 is
@@ -58,8 +54,8 @@ def plane_fit(image: RangeImage, radius: int = 2) -> Singles:
     box filters over the image.
     """
     rays = np.where(image.valid[..., None], image.rays, 0).astype(np.float64)
-    products = _means(rays[..., _ROWS] * rays[..., _COLUMNS], radius)
-    inverse = np.stack(cofactors(*np.moveaxis(products, 2, 0))[:6], axis=-1)[..., _SYMMETRIC]
+    products = _means(rays[..., ROWS] * rays[..., COLUMNS], radius)
+    inverse = np.stack(cofactors(*np.moveaxis(products, 2, 0))[:6], axis=-1)[..., SYMMETRIC]
     right = _means(rays * image.inverse[..., None], radius)
     # Cramer's rule, without the determinant: the result is normalised anyhow.
     return _towards_sensor((inverse @ right[..., None])[..., 0], image, radius)

@@ -13,6 +13,7 @@ from rangeseg_ros.core.arrays import Ints, Labels, Singles
 from rangeseg_ros.core.by_planes.plane_energy import CAP, NO_PLANE, Models
 from rangeseg_ros.core.by_planes.shifts import shift_at
 from rangeseg_ros.core.sensing.blocks import NODE
+from rangeseg_ros.core.sensing.enlargement import Cells
 from rangeseg_ros.core.sensing.moments import ray_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
@@ -35,8 +36,7 @@ def with_sharp_borders(
     Given are the regions (h, w) of bins, which have `side` pixels along their side, and the labels
     (h, w) of these among the planes of `models`. A border between two pixels costs `prior`.
     """
-    height, width = image.shape
-    labels = regions.repeat(side, axis=1).repeat(side, axis=0)[:height, :width] * image.valid
+    labels = Cells(side, 0, 0).enlarged(regions, image.shape) * image.valid
     pixels = image.inverse, image.rays, image.pinhole
     _settle(regions, surfaces, models, *pixels, sensor, prior, side, labels)
     return labels

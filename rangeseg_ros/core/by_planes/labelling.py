@@ -110,12 +110,8 @@ def _expand(
     labelling: GridLabelling,
     problem: Problem,
     models: Models,
-) -> bool:
-    """Expand one label from its front, and from what it wins at the far side of the band.
-
-    Whether that helped.
-    """
-    helped = False
+) -> None:
+    """Expand a label from its front and, where it wins, the far side of the band; in place."""
     labels, data = labelling.labels, labelling.data
     while len(front) > 0:
         sites = band(alpha, front, reach, labelling, rows)
@@ -127,6 +123,4 @@ def _expand(
                 data[p] = data_cost(int(np.intp(labels[p])), p, problem, models)
         if not expand(alpha, sites, new, labelling, LEAST_GAIN):
             break
-        helped = True
         front = beyond(alpha, sites, labelling, rows)
-    return helped

@@ -147,5 +147,4 @@ def _sum_moments(
             if label > 0:
                 ratio = w * systematic_variance(sensor, y * y)
                 add_pixel(total[label], rays[i, j], y, w, ratio)
-                total[label, COUNT] += 1
     return total

@@ -103,8 +103,6 @@ def _probability(
     if not theta.any():
         return prior
     size, square, linear, bend, scale, ratio = _residuals(sums, a, b, theta, sensor)
-    if size == 0:  # all its pixels are too far from the plane
-        return prior
     # Noise as the region itself shows it: at a grazing angle it is more than the sensor's.
     noise = alike * max((square - linear - bend) / size, 1.0)
     distortion = ratio * distortion_share(size, max(sensor.distortion_length**2, 1.0)) * size / 3

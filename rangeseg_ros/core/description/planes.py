@@ -14,15 +14,14 @@ from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER
 from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, squares
 from rangeseg_ros.core.rotations import quaternions
-from rangeseg_ros.core.sensing.moments import COUNT
+from rangeseg_ros.core.sensing.moments import COLUMNS, COUNT, ROWS
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
 
 # A border is taken seriously up to this many times the range of the farthest part of its plane.
 _FAR = 2.0
 # The upper triangle of a symmetric matrix, and how often the matrix has each of its entries.
-_ROW, _COLUMN = np.triu_indices(3)
-_TWICE = np.where(_ROW == _COLUMN, 1, 2)
+_TWICE = np.where(np.equal(ROWS, COLUMNS), 1, 2)
 
 Own = TypeVar('Own', bound='Plane')
 
@@ -239,7 +238,7 @@ def _described(fits: Fits, sensor: SensorModel) -> tuple[Floats, ...]:
     centroid = total[:, POINT : POINT + 3] / inliers
     offset = (normal * centroid).sum(axis=1)
     # The scatter matrix between the normals: its upper triangle, with the rest of it.
-    twice = _TWICE * normal[:, _ROW] * normal[:, _COLUMN]
+    twice = _TWICE * normal[:, ROWS] * normal[:, COLUMNS]
     square = (twice * total[:, SCATTER : SCATTER + 6] / inliers).sum(axis=1)
     square += distance * (2 * offset + distance)
     centroid -= (offset + distance)[:, None] * normal

@@ -10,7 +10,7 @@ from rangeseg_ros.core.arrays import Floats, Labels, Mask
 from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER, RegionSums, fit_sums, sum_regions
 from rangeseg_ros.core.fitting.uncertainty import covariance_roots, levels
 from rangeseg_ros.core.sensing.blocks import Blocks
-from rangeseg_ros.core.sensing.moments import COUNT, cofactors
+from rangeseg_ros.core.sensing.moments import COUNT, SYMMETRIC, cofactors
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -65,9 +65,8 @@ class Fits(NamedTuple):
         """Roots (M + 1, 3, 3) of the covariances of the planes, zeros where there is none."""
         known: Mask = np.asarray(self.theta.any(axis=1))
         *entries, determinant = cofactors(*self.total[:, :6].T)
-        inverse = np.stack(entries, axis=1)[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]]
-        inverse = np.where(known[:, None], inverse, 0) / np.where(known, determinant, 1)[:, None]
-        return covariance_roots(self.sums, self.level, inverse.reshape(-1, 3, 3), self.sensor)
+        inverse = np.where(known, entries, 0) / np.where(known, determinant, 1)
+        return covariance_roots(self.sums, self.level, inverse.T[:, SYMMETRIC], self.sensor)
 
 
 def _total_least_squares(total: Floats, theta: Floats) -> Floats:
@@ -75,7 +74,7 @@ def _total_least_squares(total: Floats, theta: Floats) -> Floats:
     count = np.maximum(total[:, COUNT], 1)
     mean = total[:, POINT:SCATTER] / count[:, None]
     triangle = total[:, SCATTER : SCATTER + 6] / count[:, None]
-    scatter = triangle[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    scatter = triangle[:, SYMMETRIC]
     far = np.sqrt(np.trace(scatter, axis1=1, axis2=2))
     normal = np.linalg.eigh(scatter - mean[:, :, None] * mean[:, None])[1][:, :, 0]
     distance = -(normal * mean).sum(axis=1)

@@ -12,13 +12,11 @@ from numba import njit
 
 from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.fitting.region_sums import PLACE, RAY, WEIGHT, RegionSums
-from rangeseg_ros.core.sensing.moments import COUNT, sum_by_label
+from rangeseg_ros.core.sensing.moments import COLUMNS, COUNT, ROWS, SYMMETRIC, sum_by_label
 from rangeseg_ros.core.sensing.sensor import FLOOR, SensorModel, random_variance
 
 # Standard deviations of a correlation beyond which it is zero.
 _FAR = 5.0
-# Rows and columns of an upper triangle, and where its entries are in a symmetric matrix.
-_ROW, _COLUMN, _FULL = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2), (0, 1, 2, 1, 3, 4, 2, 4, 5)
 
 
 def covariance_roots(
@@ -36,7 +34,7 @@ def covariance_roots(
     white = (1 - smooth) * random_variance(sensor, level**2)
     white *= sums.cells[:, WEIGHT] / sums.cells[:, COUNT]
     total = sum_by_label(sums.owners, white[:, None] * sums.cells[:, :6], len(inverse))
-    middle = total[:, _FULL].reshape(-1, 3, 3)
+    middle = total[:, SYMMETRIC]
     place = sums.cells[:, PLACE : PLACE + 4] / sums.cells[:, COUNT, None]
     place[:, 2:] = np.maximum(place[:, 2:] - place[:, :2] ** 2, 0)
     for field in ((sensor.correlation, *noise), (sensor.distortion_length, *distortion)):
@@ -117,7 +115,7 @@ def _halves(
             spread = (place[i, 2] + place[i, 3]) / 2
             own *= spread / max(variance + spread, 1e-300) * alike * cell[WEIGHT] / cell[COUNT]
             for entry in range(6):
-                p, q = _ROW[entry], _COLUMN[entry]
+                p, q = ROWS[entry], COLUMNS[entry]
                 centred = cell[entry] - cell[RAY + p] * cell[RAY + q] / cell[WEIGHT]
                 result[k, p, q] += own * centred / (1 + (p == q))
         for i in range(begin, end):

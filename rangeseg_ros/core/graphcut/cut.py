@@ -14,7 +14,7 @@ cost of staying or of switching.
 The cut is found by the algorithm of Boykov and Kolmogorov (TPAMI 2004), made for such grids: a
 tree grows from the sink over edges that are not saturated; where it meets a node that the source
 feeds, flow is pushed along the path, and nodes that this cuts off look for another parent in their
-tree. The tree of the source need not grow: most nodes stay, at once.
+tree. The tree of the source need not grow, as most nodes stay.
 """
 
 from __future__ import annotations
@@ -87,14 +87,13 @@ def minimum_cut(excess: Floats, neighbour: Ints, link: Floats) -> Mask:
                 if q < 0:
                     continue
                 opposite = k ^ 2
-                free = flow.residual[q, opposite] if flow.sink[p] else flow.residual[p, k]
-                if free <= 0:
+                if flow.residual[q, opposite] <= 0:
                     continue
                 if flow.parent[q] == _FREE:
-                    flow.parent[q], flow.sink[q] = opposite, flow.sink[p]
+                    flow.parent[q], flow.sink[q] = opposite, True
                     flow.stamp[q], flow.depth[q] = flow.stamp[p], flow.depth[p] + 1
                     last = _wait(flow, q, last)
-                elif flow.sink[q] != flow.sink[p]:
+                elif not flow.sink[q]:
                     side = k
                     break
                 elif flow.stamp[q] <= flow.stamp[p] and flow.depth[q] > flow.depth[p]:
@@ -151,11 +150,10 @@ def _wait(flow: _Flow, p: int, last: int) -> int:
 
 @njit(cache=True, nogil=True)
 def _push(flow: _Flow, p: int, side: int, orphans: Ints) -> int:
-    """Push what the path over the edge from `p` can take; how many `orphans` that makes."""
+    """Push what the path over this edge of a sink node can take; how many `orphans` that makes."""
     neighbour, residual = flow.neighbour, flow.residual
     terminal, parent = flow.terminal, flow.parent
-    if flow.sink[p]:
-        p, side = neighbour[p, side], side ^ 2
+    p, side = neighbour[p, side], side ^ 2
     pushed = residual[p, side]
     # From p up to the source, against the flow, and from its neighbour on to the sink.
     for sink in range(2):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.arrays import Floats, Mask, Singles
 from rangeseg_ros.core.runtime.threads import map_halves
-from rangeseg_ros.core.sensing.moments import SIZE, fit_all, ray_of
+from rangeseg_ros.core.sensing.moments import SIZE, SYMMETRIC, fit_all, ray_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 from rangeseg_ros.core.significance import OUTLIER
@@ -35,8 +35,6 @@ _ROWS = 120
 _DOWN, _RIGHT = 4, 2
 # The prior counts as so much of a window full of ground: it decides where little of it is seen.
 _PRIOR = 1 / 16
-# Entries of the symmetric matrix whose upper triangle moments begin with.
-_MATRIX = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 class CellSize(NamedTuple):
@@ -218,7 +216,7 @@ def _fitted(sums: Floats, prior: Floats) -> Floats:
     moments = np.zeros((*ground.shape[:2], SIZE))
     moments[..., :9] = ground
     moments[..., :6] += _PRIOR * seen[..., :6]
-    moments[..., 6:9] += _PRIOR * (seen[..., _MATRIX] * prior).sum(axis=3)
+    moments[..., 6:9] += _PRIOR * (seen[..., SYMMETRIC] * prior).sum(axis=3)
     theta = fit_all(moments.reshape(-1, SIZE))[0].reshape(*ground.shape[:2], 3)
     known = theta.any(axis=2) & (ground[..., 5] > 0)
     return np.where(known[..., None], theta, prior)

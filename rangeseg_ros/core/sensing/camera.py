@@ -79,7 +79,7 @@ class Camera:
         values |= {name: positive_integer(name, given[name]) for name in ('width', 'height')}
         values |= {name: _finite(name, given[name]) for name in ('fx', 'fy', 'cx', 'cy', 'skew')}
         for name in ('turn', 'place'):
-            values[name] = tuple(_finite(name, part) for part in given[name])
+            values[name] = tuple(_finite(name, part) for part in np.atleast_1d(given[name]))
         try:
             lens = checked_lens(self.distortion_model, self.d)
         except (TypeError, ValueError, AttributeError, OverflowError) as error:
@@ -113,7 +113,7 @@ class Camera:
         """
         if not 0 < _finite('field of view', degrees) < 180:
             raise CameraError(f'field of view must be between 0 and 180 degrees, not {degrees}')
-        focal = width / (2 * math.tan(math.radians(degrees) / 2))
+        focal = _finite('width', width) / (2 * math.tan(math.radians(degrees) / 2))
         return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
     def _check_rays(self) -> None:

@@ -22,10 +22,10 @@ _FRAME = 2 * _WINDOW - 1  # the farthest window that a boundary looks at
 _SOBEL_GAIN = 4  # response of the operator of 3 x 3 to a step of one: 1 + 2 + 1
 
 
-def jump_edges(image: RangeImage, method: str, *steps: ArrayLike) -> GridEdges | None:
-    """Jump edges by method `plane`, `sobel` or `none`; the first takes the smallest steps."""
+def jump_edges(image: RangeImage, method: str, *limits: ArrayLike) -> GridEdges | None:
+    """Jump edges by method `plane`, `sobel` or `none`; `limits` are those of `plane_deviation`."""
     if method == 'plane':
-        return plane_deviation(image, *steps)
+        return plane_deviation(image, *limits)
     return sobel(image) if method == 'sobel' else None
 
 
@@ -173,11 +173,9 @@ def sobel(image: RangeImage) -> GridEdges:
     ridge = np.where(np.abs(gx) >= np.abs(gy), across, down) & (strength > threshold**2)
     pixels = bridge_edges(ridge | ~valid) & valid
     step = threshold / _SOBEL_GAIN
-    horizontal = (np.abs(np.diff(depth, axis=1)) > step) & valid[:, 1:] & valid[:, :-1]
-    vertical = (np.abs(np.diff(depth, axis=0)) > step) & valid[1:] & valid[:-1]
-    horizontal |= pixels[:, 1:] | pixels[:, :-1]
-    vertical |= pixels[1:] | pixels[:-1]
-    return horizontal, vertical
+    horizontal = (np.abs(np.diff(depth, axis=1)) > step) | pixels[:, 1:] | pixels[:, :-1]
+    vertical = (np.abs(np.diff(depth, axis=0)) > step) | pixels[1:] | pixels[:-1]
+    return horizontal & valid[:, 1:] & valid[:, :-1], vertical & valid[1:] & valid[:-1]
 
 
 def pixels_beside(edges: GridEdges) -> Mask:

@@ -22,6 +22,9 @@ from rangeseg_ros.core.arrays import Floats, Singles
 SIZE = 13  # of the vector of sums
 # Entries: w y^2, number of pixels, sums of the two variance ratios.
 CHI2, COUNT, RATIO, SLOPE = 9, 10, 11, 12
+# Rows and columns of the entries of an upper triangle, and which of these are in a whole matrix.
+ROWS, COLUMNS = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
+SYMMETRIC = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
 NO_PIXEL = (0.0,) * (CHI2 + 1)  # see `plus_pixel`
 
 
@@ -75,14 +78,14 @@ def add_pixel(
     weight: float,
     ratio: float,
 ) -> None:
-    """Add a pixel to a moment vector (13,), but for the count.
+    """Add a pixel to a moment vector (13,).
 
-    `weight` is 1 / random variance, `ratio` the systematic over the random variance, each times
-    the pixels that it stands for.
+    `weight` is 1 / random variance, `ratio` the systematic over the random variance.
     """
     x, y, z = np.float64(ray[0]), np.float64(ray[1]), np.float64(ray[2])
     for entry, value in enumerate(plus_pixel(NO_PIXEL, x, y, z, inverse, weight)):
         moments[entry] += value
+    moments[COUNT] += 1
     moments[RATIO] += ratio
 
 

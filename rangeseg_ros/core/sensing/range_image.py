@@ -137,7 +137,7 @@ class RangeImage:
         image = cls(camera.rays, inverse, camera)
         # Millimetres of 16 bits are never as far.
         if not integers or scale > 0.001:
-            image._doubt_unit('pixels')
+            image._doubt_unit()
         return image
 
     @classmethod
@@ -183,7 +183,7 @@ class RangeImage:
             inverse = _reciprocal(np.sqrt(np.einsum('ijk,ijk->ij', cloud, cloud)), 1.0)
         rays = (cloud * inverse[..., None]).astype(np.float32)
         image = cls(rays, inverse)
-        image._doubt_unit('points')
+        image._doubt_unit()
         return image
 
     def dithered(self, sigma: float, seed: int) -> RangeImage:
@@ -199,11 +199,11 @@ class RangeImage:
             raise RangeImageError(f'the mask is {width}x{height}, the image {columns}x{rows}')
         return replace(self, inverse=np.where(body, np.float32(0), self.inverse), body=body)
 
-    def _doubt_unit(self, measured: str) -> None:
+    def _doubt_unit(self) -> None:
         known = self.inverse[self.valid]
         for off, far in ((known < 1 / FAR, f'beyond {FAR}'), (known > 1 / NEAR, f'below {NEAR}')):
             if 2 * np.count_nonzero(off) > known.size:
-                told = f'more than half of the {measured} are {far} m: are they in metres?'
+                told = f'more than half of the ranges are {far} m: are they in metres?'
                 warnings.warn(told, UnitWarning, stacklevel=3)
 
     @property

@@ -104,8 +104,9 @@ class SensorModel(NamedTuple):
             if value > 0
         ]
         # Over as many pixels as the correlation along a line sums to.
-        if self.white < 0.5 and _LINE * self.correlation > 1:
-            said.insert(1, f'correlated over {_LINE * self.correlation:.0f} px')
+        kinds = sum(value > 0 for _, value, *_ in errors[:2])
+        if kinds and self.white < 0.5 and _LINE * self.correlation > 1:
+            said.insert(kinds, f'correlated over {_LINE * self.correlation:.0f} px')
         return ', '.join(said)
 
     @property

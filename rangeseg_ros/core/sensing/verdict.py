@@ -23,7 +23,7 @@ _FEWEST = 40  # pixels that tell the bend of a plane
 _SAMPLE = 5000  # pixels that stand for an image
 # Step of the inverse depth of a Kinect, 1/m: an eighth of a pixel at 580 px and 75 mm.
 _KINECT_STEP = 1 / (8 * 580 * 0.075)
-# Quotients of the units that files have: 1/1000, 1/5000 and 1/10000 m, and metres.
+# Units that are confused: 1/1000 m with 1/5000 m, 1/10000 m and metres, and the reverse.
 _WRONG_UNITS = (5.0, 0.2, 10.0, 0.1, 1000.0, 0.001)
 # Reasons for which every metric result is wrong, not only less certain.
 _INVALID = {
