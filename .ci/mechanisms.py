@@ -150,7 +150,7 @@ MECHANISMS = (
               {'by_planes.labelling.run_halves': _returning(None),
                'by_planes.labelling.shifts':
                lambda _: lambda surfaces, blocks, theta, *rest: Shifts.none(len(theta))}),
-    Mechanism('bins of 2 x 2 pixels, not of 4 x 4', 'sensing/binning.py:step_within',
+    Mechanism('bins of 2 x 2 pixels, not of 4 x 4', 'sensing/binning.py:widening',
               {'work_budget': 0.9}),
     Mechanism('bins, not pixels', 'sensing/binning.py',
               {'segmenter.bin_side': _returning(1)}),

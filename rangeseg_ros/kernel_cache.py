@@ -40,13 +40,13 @@ def choose_cache() -> None:
     The first that can be written to, and not by other users: `NUMBA_CACHE_DIR`, the package
     (whoever can write there can change the sources), the user's cache folder, a temporary one for
     this process. Kernels that were compiled into a package which is read-only are copied there.
-    `CacheWarning` where it is not the named one or goes with the process; OSError without any.
+    `CacheWarning` where `NUMBA_CACHE_DIR` is not used or the folder is temporary; OSError if none.
     """
     _choose_processor()
     given = os.environ.pop('NUMBA_CACHE_DIR', None)
     folder = _own_folder(Path(given)) if given else None
     if given and folder is None:
-        _warn(f'NUMBA_CACHE_DIR: {given} is not used: it cannot be written to, or others can')
+        _warn(f'NUMBA_CACHE_DIR: {given} is not used: not writable, or writable by other users')
     if folder is None and writable(PACKAGE / 'core' / '__pycache__'):
         drop_outdated(PACKAGE)
     elif folder is None:
@@ -94,7 +94,7 @@ def _own_folder(root: Path) -> Path | None:
     """Folder within `root` for this state of the sources; None where it is not ours alone."""
     state = hashlib.sha256(repr(_state(PACKAGE)).encode()).hexdigest()
     name = f'rangeseg_ros-{state[:16]}'
-    # Other than a process that was told of it by the one that started it.
+    # `root` has this name already where the parent process has set NUMBA_CACHE_DIR.
     folder = root if root.name == name else root / name
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -134,8 +134,8 @@ def _temporary_folder() -> Path:
 def drop_outdated(package: Path) -> None:
     """Remove kernels compiled beside sources that have changed, or that import such sources.
 
-    And all of another version of numba, which reads its index of a kernel before its code: if the
-    one was replaced and the other not, as on a full disk, it would run or refuse what is old.
+    If numba has changed, remove all: it reads the index of a kernel before its code, and would run
+    or reject old code if only one of them was replaced, as on a full disk.
     """
     note, now = package / _SOURCES, _state(package)
     before = _read(note)

@@ -30,9 +30,9 @@ def rangeseg() -> None:
 def segment_planes() -> None:
     """Run the node."""
     try:
-        from rangeseg_ros.ros.memory import share_memory
+        from rangeseg_ros.ros.memory import use_one_arena
 
-        share_memory()  # before rclpy starts its threads
+        use_one_arena()  # before rclpy starts its threads
         from rangeseg_ros.ros.node import main
     except ModuleNotFoundError as error:
         if error.name != 'rclpy':

@@ -9,7 +9,7 @@ from rangeseg_ros.core.by_planes.borders import with_sharp_borders
 from rangeseg_ros.core.by_planes.plane_energy import CAP, NO_PLANE, Models
 from rangeseg_ros.core.by_planes.shifts import Shifts
 from rangeseg_ros.core.options import ConfigError
-from rangeseg_ros.core.sensing.binning import STEPS, Bins, bin_side, step_within
+from rangeseg_ros.core.sensing.binning import BUDGETS, Bins, bin_side, widening
 from rangeseg_ros.core.sensing.blocks import NODE
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.evaluation.label_files import as_truth
@@ -30,9 +30,9 @@ def test_images_of_any_size_have_about_as_many_bins():
     """And fewer where there is less time."""
     sides = {(240, 320): 1, (480, 640): 2, (480, 848): 2, (720, 1280): 3, (1080, 1920): 5}
     steps = {1: 1, 0.9: 2, 0.56: 2, 0.55: 2, 0.54: 4, 0.36: 4, 0.35: 4, 0.34: 4, 0: 4}
-    assert STEPS == (1, 0.55, 0.35)
+    assert BUDGETS == (1, 0.55, 0.35)
     for budget, step in steps.items():
-        assert step_within(budget) == step
+        assert widening(budget) == step
         for shape, side in sides.items():
             assert bin_side(shape, budget) == step * side
 
@@ -188,7 +188,7 @@ def room():
     return RangeImage.from_depth(frame.depth, camera), frame.labels
 
 
-@pytest.mark.parametrize('budget', [*STEPS, 0.0])
+@pytest.mark.parametrize('budget', [*BUDGETS, 0.0])
 def test_planes_are_those_of_the_scene(room, budget):
     """Every wall, floor and ceiling of a twelfth of the image is found, its pixels too."""
     image, truth = room

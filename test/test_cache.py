@@ -21,7 +21,7 @@ from rangeseg_ros.compilation import preparation
 from rangeseg_ros.compilation.preparation import FIRST, KINDS, _compile, needs, prepare, rehearse
 from rangeseg_ros.compilation.worker import discover
 from rangeseg_ros.core.runtime.kernels import nothing_compiled
-from rangeseg_ros.core.sensing.binning import STEPS
+from rangeseg_ros.core.sensing.binning import BUDGETS
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
@@ -200,7 +200,7 @@ def test_frames_need_nothing_more(method):
     """Of any size, as clouds, and with less of the work, which changes while frames come."""
     config = Config(method=method)
     prepare(config)
-    budgets = [replace(config, work_budget=step) for step in STEPS[1:] if method == 'planes']
+    budgets = [replace(config, work_budget=step) for step in BUDGETS[1:] if method == 'planes']
     for shape, configs in (((24, 32), [config]), ((121, 212), [config, *budgets])):
         camera = kinect_camera(*shape[::-1])
         x, y = camera.rays[..., 0], camera.rays[..., 1]

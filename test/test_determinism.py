@@ -16,13 +16,13 @@ from processes import python
 
 from rangeseg_ros import Camera, Config, RangeImage
 from rangeseg_ros.core.runtime.threads import Task, map_halves, sharing_cores
-from rangeseg_ros.core.sensing.binning import STEPS
+from rangeseg_ros.core.sensing.binning import BUDGETS
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
 
-CASES = [{}, {'method': 'normals'}, *({'work_budget': step} for step in STEPS[1:])]
+CASES = [{}, {'method': 'normals'}, *({'work_budget': step} for step in BUDGETS[1:])]
 SHAPES = [(1, 1), (1, 2), (2, 1), (1, 97), (97, 1), (2, 2), (3, 3), (5, 64), (17, 33), (37, 49)]
 
 

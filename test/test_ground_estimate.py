@@ -7,7 +7,7 @@ from terrain_scenes import FLOOR, KINECT, drop_of, gap, scene, share, view
 
 from rangeseg_ros import Camera, Config, RangeImage
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE
-from rangeseg_ros.core.ground.estimate import HIGHEST, STEPS, continued
+from rangeseg_ros.core.ground.estimate import HIGHEST_STEP, STEP_PRIOR, continued
 from rangeseg_ros.core.ground.terrain import terrain_of
 from rangeseg_ros.core.segmentation import STATED
 from rangeseg_ros.simulation.sensors.kinect import Kinect
@@ -53,9 +53,9 @@ def test_the_ground_continued_errs_as_least_squares_say(offset, sd):
     known = np.linalg.inv(design.T @ design)[0, 0]
     assert seen.error == pytest.approx(np.sqrt(0.01**2 + known + bent**2), rel=1e-6)
     a, step = seen.plane[0], Config().least_step
-    same = (1 - STEPS) * norm.pdf(a, scale=seen.error)
+    same = (1 - STEP_PRIOR) * norm.pdf(a, scale=seen.error)
     tails = norm.sf(step, a, seen.error) + norm.cdf(-step, a, seen.error)
-    other = STEPS * tails / (2 * (HIGHEST - step))
+    other = STEP_PRIOR * tails / (2 * (HIGHEST_STEP - step))
     assert seen.confidence == pytest.approx(same / (same + other), rel=1e-9)
 
 

@@ -11,7 +11,7 @@ from processes import python
 from ros_bench import Bench, benches, values_of
 
 from rangeseg_ros import Config, RangeImage, Segmenter
-from rangeseg_ros.core.sensing.binning import STEPS
+from rangeseg_ros.core.sensing.binning import BUDGETS
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
@@ -68,8 +68,8 @@ node, bench = benches('labels', 'status', camera=kinect_camera(161, 121))
 def test_every_frame_is_made_again_with_what_it_records(bench):
     depth = simulate(kinect_room(2), Kinect(0), bench.camera, seed=2).depth
     image = RangeImage.from_depth(depth, bench.camera)
-    offline = {step: Segmenter(Config(work_budget=step)).segment(image).labels for step in STEPS}
-    assert all((offline[1.0] != offline[step]).any() for step in STEPS[1:])
+    offline = {step: Segmenter(Config(work_budget=step)).segment(image).labels for step in BUDGETS}
+    assert all((offline[1.0] != offline[step]).any() for step in BUDGETS[1:])
 
     def next_budget():
         image = bench.image(depth)
@@ -83,10 +83,10 @@ def test_every_frame_is_made_again_with_what_it_records(bench):
     assert [next_budget() for _ in range(3)] == [1.0] * 3
     # No machine does it: the least of the work, with steps on the way.
     bench.set_parameters(target_rate=1000.0)
-    assert bench.until(lambda: next_budget() == STEPS[-1])
-    bench.status(lambda status: values_of(status)['work_budget'] == f'{STEPS[-1]:g}')
+    assert bench.until(lambda: next_budget() == BUDGETS[-1])
+    bench.status(lambda status: values_of(status)['work_budget'] == f'{BUDGETS[-1]:g}')
     # What every machine does, at once: the steering begins anew.
     bench.set_parameters(target_rate=0.001)
     assert [next_budget() for _ in range(3)] == [1.0] * 3
-    bench.set_parameters(target_rate=0.0, work_budget=STEPS[1])
-    assert [next_budget() for _ in range(2)] == [STEPS[1]] * 2
+    bench.set_parameters(target_rate=0.0, work_budget=BUDGETS[1])
+    assert [next_budget() for _ in range(2)] == [BUDGETS[1]] * 2

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.sensing.binning import STEPS, step_within
+from rangeseg_ros.core.sensing.binning import BUDGETS, widening
 from rangeseg_ros.ros import counting
 from rangeseg_ros.ros.counting import Losses, Window
 from rangeseg_ros.ros.diagnostics import FrameStatistics
@@ -147,7 +147,7 @@ def test_all_is_done_where_there_is_time_for_it_or_no_rate_to_hold(rate, most, t
 def test_of_three_frames_two_slow_ones_are_followed_at_once():
     pace = Pace(30, 1.0)
     budgets(pace, 3, 0.02)
-    assert budgets(pace, 3, 3.0)[0].tolist() == [1.0, 1.0, STEPS[-1]]
+    assert budgets(pace, 3, 3.0)[0].tolist() == [1.0, 1.0, BUDGETS[-1]]
 
 
 @pytest.mark.parametrize('full', np.linspace(0.024, 0.055, 12))
@@ -159,24 +159,24 @@ def test_the_rate_is_held_without_chatter(full):
 
 def test_what_cannot_be_held_gets_the_least_and_recovers_at_once():
     pace = Pace(30, 1.0)
-    assert budgets(pace, 1000, 10.0)[0, -1] == STEPS[-1]
+    assert budgets(pace, 1000, 10.0)[0, -1] == BUDGETS[-1]
     # Nothing has wound up: each step takes three seconds at least, and the filter one in all.
     recovered = budgets(pace, 600, 0.01)[0].tolist()
-    assert recovered.index(1.0) * PERIOD < 3.5 * (len(STEPS) - 1) + 1
-    assert all(recovered.count(step) * PERIOD >= 3 for step in STEPS)
+    assert recovered.index(1.0) * PERIOD < 3.5 * (len(BUDGETS) - 1) + 1
+    assert all(recovered.count(step) * PERIOD >= 3 for step in BUDGETS)
 
 
 def test_what_else_takes_time_counts():
     for other, step in ((0.014, 1), (1.0, -1)):
-        assert budgets(Pace(30, 1.0), 300, 0.02, other)[0, -1] == STEPS[step]
+        assert budgets(Pace(30, 1.0), 300, 0.02, other)[0, -1] == BUDGETS[step]
 
 
 @pytest.mark.parametrize('most', [0.97, 0.95, 0.8, 0.3, 0.0])
 def test_work_budget_is_the_most(most):
     assert set(budgets(Pace(30, most), 300, 0.001)[0]) == {most}
     slow, _ = budgets(Pace(30, most), 300, 1.0)
-    assert slow[-1] == min(most, STEPS[-1])
-    assert all(step_within(a) != step_within(b) for a, b in pairwise(slow) if a != b)
+    assert slow[-1] == min(most, BUDGETS[-1])
+    assert all(widening(a) != widening(b) for a, b in pairwise(slow) if a != b)
 
 
 @pytest.mark.parametrize('rate', [0.01, 1.0, 1000.0])
@@ -185,4 +185,4 @@ def test_any_times_give_a_budget(rate, refining):
     pace = Pace(rate, 1.0)
     for other in (0.0, 1e-9, 1e6, 0.0):
         pace.add(refining, other)
-        assert pace.budget in STEPS
+        assert pace.budget in BUDGETS

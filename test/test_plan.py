@@ -253,7 +253,7 @@ def sighted(edge, direction, pose, random, count):
 def test_openings_are_wide_and_the_ground_was_seen_in_them():
     """Gaps along x of which one is narrower than two cells, and of one half was not seen."""
     grid = PlaneGrid(0.1)
-    grid.reach(np.array([(0, 0), (4, 0)]))
+    grid.extend_to(np.array([(0, 0), (4, 0)]))
     free = np.full(grid.odds.shape, FREE)
     free[:, 25:] = FREE + 1
     places = np.array([(0, 1), (1.15, 1.5), (2, 2.25), (2.85, 4)])

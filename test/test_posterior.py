@@ -106,7 +106,7 @@ def test_the_evidence_is_that_of_residuals_along_the_crease():
     inverse = 0.5 + 0.05 * X - 0.2 * X**2 - 0.05 * X * CAMERA.rays[..., 1]
     sums, _, theta, *_ = fitted(inverse, np.where(X < 0.1, 1, 2))
     sensor = SENSOR._replace(range_noise=0.01)
-    found = _evidence(sums, 1, 2, theta, sensor, sensor.correlated)
+    found = _evidence(sums, 1, 2, theta, sensor, sensor.region_inflation)
     parts = [sums.cells[sums.start[k] : sums.start[k + 1]] for k in (1, 2)]
     cells, part = np.vstack(parts), np.repeat([0, 1], [len(one) for one in parts])
     root = np.sqrt(cells[:, COUNT])
@@ -121,7 +121,7 @@ def test_the_evidence_is_that_of_residuals_along_the_crease():
     crease = planes - terms @ np.linalg.lstsq(terms, planes, rcond=None)[0]
     for k in range(2):
         mine = part == k
-        noise = max(sensor.correlated, own[mine] @ own[mine] / (mine.sum() - 3))
+        noise = max(sensor.region_inflation, own[mine] @ own[mine] / (mine.sum() - 3))
         ratio = own[mine] @ own[mine] - ((own + crease)[mine] ** 2).sum()
         assert found[k] == pytest.approx(ratio / (2 * noise), rel=1e-5)
     assert min(found) > 0
@@ -134,7 +134,7 @@ def test_two_regions_are_one_surface_as_far_as_their_evidence_says(bend, width):
     inside = (-0.6 * width < X) & (width > X) & (abs(CAMERA.rays[..., 1]) < width)
     regions = np.where(X < 0, 1, 2) * inside
     sums, _, theta, *_ = fitted(inverse, regions)
-    own = np.array(_evidence(sums, 1, 2, theta, SENSOR, SENSOR.correlated))
+    own = np.array(_evidence(sums, 1, 2, theta, SENSOR, SENSOR.region_inflation))
     alone, beside = alone_and_beside(inverse, regions, [1, 2])
     change = (beside - alone)[1:]
     together = alone[1:] + change * (1 + np.exp(-own) + np.exp(-own.sum()))

@@ -112,8 +112,8 @@ def test_the_less_new_each_pixel_tells_the_more_unlike_labels_cost():
     image = RangeImage(np.ones((5, 6, 3), np.float32), np.ones((5, 6), np.float32))
     sensors = SENSOR, SENSOR._replace(correlation=0.0)
     links, of_white = (Problem.of(image, each, grid_of(image), LAMBDA).links for each in sensors)
-    assert SENSOR.patch > 2 and sensors[1].patch == 1
-    np.testing.assert_allclose(links, SENSOR.patch * of_white, rtol=1e-6)
+    assert SENSOR.pixel_inflation > 2 and sensors[1].pixel_inflation == 1
+    np.testing.assert_allclose(links, SENSOR.pixel_inflation * of_white, rtol=1e-6)
     assert of_white.max() == pytest.approx(LAMBDA)
 
 

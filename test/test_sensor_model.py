@@ -232,7 +232,7 @@ def test_steps_are_those_of_the_flat_blocks_around():
     around = minimum_filter(np.where(flat, slope, 9), 3), maximum_filter(flat * slope, 3)
     # 0 where none around is flat.
     least, most = (np.where(flat, slope, np.where(found < 9, found, 0)) for found in around)
-    known = [5 * np.sqrt(0.72 * sensor.agreement * (1e-6 + 0.16 * t)) for t in (least, most)]
+    known = [5 * np.sqrt(0.72 * sensor.block_inflation * (1e-6 + 0.16 * t)) for t in (least, most)]
     known = np.maximum(known, 2.2 * np.maximum(0.003, 0.004 * squared))
     np.testing.assert_allclose(steps, [*known, np.sqrt(least)], rtol=1e-5)
     assert 20 < flat.sum() < 60 and (maximum_filter(flat, 3) == 0).any()
@@ -269,10 +269,10 @@ def test_a_patch_is_what_the_mean_of_four_pixels_keeps_of_the_noise(white, width
     squared = ((places[:, None] - places) ** 2).sum(axis=2)
     field = np.exp(-squared / (4 * width**2)) if width else np.eye(4)
     covariance = white * np.eye(4) + (1 - white) * field
-    assert sensor.patch == pytest.approx(4 * covariance.mean(), rel=1e-9)
+    assert sensor.pixel_inflation == pytest.approx(4 * covariance.mean(), rel=1e-9)
     # And a large region: the sum of all correlations with a pixel.
     alike = np.exp(-(np.arange(-40, 41) ** 2) / (4 * width**2)).sum() ** 2 if width else 1
-    assert sensor.correlated == pytest.approx(white + (1 - white) * alike, rel=1e-6)
+    assert sensor.region_inflation == pytest.approx(white + (1 - white) * alike, rel=1e-6)
 
 
 def test_what_is_said_of_the_errors():

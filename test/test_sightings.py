@@ -39,7 +39,7 @@ def test_whatever_a_camera_looks_at_is_in_the_part_in_sight(camera):
     known = PlaneSet(normal, random.normal(0, 2, (200, 3)), tangents(normal))
     grids = [PlaneGrid(0.1) for _ in normal]
     for grid in grids:
-        grid.reach(np.array([[-1.5, -1.0], [1.5, 2.0]]))
+        grid.extend_to(np.array([[-1.5, -1.0], [1.5, 2.0]]))
         grid.add(np.ones(grid.odds.shape, bool), HIT)
     shown = in_sight(grids, known, image)
     through = hidden = 0

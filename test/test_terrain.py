@@ -194,7 +194,7 @@ def test_what_was_the_ground_stays_it_while_it_is_out_of_view():
     assert share('table', 1.1, OBSTACLE) > 0.9
     assert share('landing', 1.2, GROUND) < 0.01
     assert share('wall', 1.3, OBSTACLE) > 0.95
-    assert 'm below, as is known' in str(ground_at('wall', 1.4))
+    assert 'm below, the height that is stated or remembered' in str(ground_at('wall', 1.4))
     assert share('floor', 1.5, GROUND) > 0.95
     # Neither an image nor those before it tell of a step out of view.
     assert ground_at('floor', 1.5).stand.confidence == 0.9

@@ -1,4 +1,4 @@
-"""Recordings to the sightings of planes, in parts that many processes make and that are kept."""
+"""Sightings of planes in recordings, computed by many processes in parts that are kept."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ class ResidualsOfFrame:
         for version in (image, self.distortion.corrected(image)):
             result = segmenter.segment(version)
             residual = np.full(image.shape, np.nan, np.float32)
-            along = np.where(version.valid, version.along, 1)
+            along = np.where(version.valid, version.depth_over_range, 1)
             for plane in result.planes:
                 mask = result.labels == plane.label
                 theta = -plane.normal / (plane.distance + plane.normal @ version.place)

@@ -52,7 +52,7 @@ class _LazyGroup(click.Group):
         return command
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        # Without a command what there is, and no error.
+        # Without a command, print the help and do not fail.
         return super().parse_args(ctx, args if args not in ([], ['help']) else ['--help'])
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -85,7 +85,7 @@ def main() -> None:
             interrupts.end()
         raise
     except BaseException as error:
-        # What a signal raises libraries may take for an error of what they read.
+        # Libraries may turn the exception of a signal into an error of their own.
         if interrupts.exit_code():
             interrupts.end()
         if isinstance(error, (KeyboardInterrupt, click.Abort)):

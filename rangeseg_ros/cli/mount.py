@@ -27,10 +27,10 @@ from rangeseg_ros.io.bags import DepthBag
 def command(ctx: click.Context, recording: Path, base: str, config: Config) -> None:
     """Find roll, pitch and height of a camera above the floor.
 
-    The camera stays where it is on its robot, which may drive: the floor is the largest plane
-    facing up that does not move. Prints both angles and the height with their standard deviations,
-    a static_transform_publisher and the origin of a URDF joint. Yaw and the position over the
-    floor cannot be estimated from the floor. If the floor is uncertain, says why; exit code 1.
+    The camera stays where it is on its robot, which may drive: of the planes that face up, the
+    floor has the largest area times observations. Prints both angles and the height with their
+    standard deviations, a static_transform_publisher and the origin of a URDF joint. Yaw and the
+    position over the floor are not estimated. If the floor is uncertain, says why; exit code 1.
     """
     # The frame is the camera's own, and its place in that has no error.
     sequence = SequenceSegmenter(replace(config, pose_noise=0.0, pose_turn_noise=0.0))

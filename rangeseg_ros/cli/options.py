@@ -226,7 +226,7 @@ def check_new(paths: Iterable[Path], inputs: Iterable[Path], overwrite: bool) ->
 
 
 def check_distinct(names: Iterable[str], what: str) -> None:
-    """Refuse inputs of one name, which results are called by."""
+    """Refuse inputs of equal names, as results are named after them."""
     name, number = Counter(names).most_common(1)[0]
     if number > 1:
         raise click.UsageError(f'{number} {what} named {name} would write the same results')

@@ -37,8 +37,8 @@ FIRST = ('labels', 'planes')
 Report = Callable[[str], None]
 _BEGIN = 'compiling kernels'
 _WIDTH = 30
-# Of frames that have all that is compiled run, see `rehearse`. Exact ones take minutes if large:
-# the least that takes the path of large frames.
+# Scale of the frames of `rehearse`. Exact solutions of large frames take minutes: they get the
+# smallest scale that takes the path of large frames.
 _SIZE, _EXACT_SIZE = 10, 5
 # Metres at a metre. The second frame finds the planes of the first; many of the third are new.
 _NOISE = (0.001, 0.001, 0.03)
@@ -90,7 +90,7 @@ def show(progress: str) -> None:
 def _compile(report: Report, *rehearsed: Any) -> None:
     """Fill the cache with what `rehearse(*rehearsed)` needs.
 
-    What a process that breaks off leaves is compiled by its user.
+    What the worker leaves when it fails is compiled by the frame that calls it.
     """
     # Of this package, not of one in the current folder (Python 3.11), whose kernels are others.
     path = os.pathsep.join(filter(None, [*sys.path, str(Path(__file__).parents[2])]))
@@ -110,7 +110,7 @@ def _compile(report: Report, *rehearsed: Any) -> None:
             done, count = line.split()
             report(f'{_BEGIN}, {done.decode()} of {count.decode()}')
     except BrokenPipeError:
-        pass  # its user will meet the kernel itself, and say what is wrong with it
+        pass  # the frame that calls the kernel compiles it, and reports what is wrong
     except BaseException:
         os.killpg(worker.pid, signal.SIGTERM)
         raise

@@ -13,7 +13,7 @@ from rangeseg_ros.core.options import ConfigError, checked, option, unknown_para
 # Directions of an icosahedron by how often it is subdivided (thesis, table A.3).
 DIRECTION_COUNTS = (4, 17, 73, 305, 1249)
 VGA = 640 * 480
-"""Pixels of the image that numbers of pixels are meant for; others show things as much larger."""
+"""Pixels of the reference image: defaults in pixels scale with the size of the image."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -177,7 +177,7 @@ class Config:
     )
     grid_clearance: float = option(2.0, 'headroom of ~/grid, metres', 0.0, 100.0)
     cloud_resolution: float = option(
-        0.0, 'side of the cells of ~/ground and ~/obstacles, metres; 0 = all pixels', 0.0, 1.0
+        0.0, 'side of the cubes that thin the clouds of terrain, metres; 0 = all pixels', 0.0, 1.0
     )
     seed: int = option(0, 'of dithering', 0, 2147483647)
 

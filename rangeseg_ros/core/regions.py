@@ -40,7 +40,7 @@ def connected_components(labels: NDArray[np.integer], grid: Grid, valid: Mask) -
     """
     (height, width), (right, below) = labels.shape, grid
     found = np.zeros((height, width), np.int32)
-    # Of each number an equivalent, lower one, or itself.
+    # Union-find: parent[k] is a lower number of the same component, or k itself.
     parent = np.empty(labels.size + 1, np.int32)
     count = 0
     for i in range(height):
@@ -75,7 +75,7 @@ def region_sizes(regions: NDArray[np.integer], count: int) -> Indices:
     """Pixels (count,) of each region 0...count - 1."""
     sizes = np.zeros(count, np.intp)
     for i in range(len(regions)):
-        # By runs: one counter cannot take a pixel more before it has taken the last.
+        # Count runs, not pixels: increments of one counter would wait for each other.
         last, begin = regions[i, 0], 0
         for j in range(regions.shape[1]):
             if regions[i, j] != last:

@@ -33,7 +33,7 @@ STATED = SensorModel.from_config(Config())
 
 
 class Labelling(Protocol):
-    """What a method labels the pixels with, as far as results are made of it."""
+    """The part of a method's labelling that a `Segmentation` needs."""
 
     def energy(self) -> float:
         """Value of eq. 5.3."""
@@ -42,7 +42,7 @@ class Labelling(Protocol):
         """Normals (H, W, 3) that the labels stand for; None where the planes have them."""
 
 
-class WorkedOut(NamedTuple):
+class StoredLabelling(NamedTuple):
     """A `Labelling` without the image it is of: what remains of it in a pickle."""
 
     value: float
@@ -103,7 +103,7 @@ class Segmentation:
     timings: dict[str, float]
     reason: str
     sensor: SensorModel = STATED
-    labelling: Labelling = field(default=WorkedOut(0.0, None), repr=False)
+    labelling: Labelling = field(default=StoredLabelling(0.0, None), repr=False)
     jumps: GridEdges | None = field(default=None, repr=False)
     survey: Survey | Terrain | None = field(default=None, repr=False)
     upright: tuple[float, float, float] | None = None
@@ -237,7 +237,7 @@ class Segmentation:
 
     @cached_property
     def grid(self) -> GroundGrid | None:
-        """The ground around the robot, of this image and those before that were asked for it."""
+        """The ground around the robot, of this image and earlier ones whose `grid` was read."""
         if not isinstance(self.survey, Survey) or self.ground is None:
             return None
         return self.survey.ground_grid(self.ground)
@@ -283,7 +283,7 @@ class Segmentation:
 
     def __getstate__(self) -> dict[str, Any]:
         kept = {name: getattr(self, name) for name in ('verdict', 'stairs', 'tilt')}
-        labelling = WorkedOut(self.energy, self.labelling.normals())
+        labelling = StoredLabelling(self.energy, self.labelling.normals())
         return {
             **self.__dict__,
             **kept,

@@ -35,7 +35,7 @@ from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # What is begun of an image: its bins, and nested blocks of these.
-Begun = Task[tuple[Bins, list[Blocks]]]
+BinsTask = Task[tuple[Bins, list[Blocks]]]
 
 
 class Stopwatch:
@@ -92,21 +92,21 @@ class Segmenter:
             )
         if config.mask and image.body is None:
             raise RangeImageError('mask is not applied yet: segment corrected(image, config)')
-        # Begun before it is known whether the values are those of depth.
+        # BinsTask before it is known whether the values are those of depth.
         begun = Task(_binned, image, self._side(image))
         if (q := encoding(image)) is not None:
             depth = decoded(image, q)
-            result = self._undone(depth, enlargement(depth))
+            result = self._segment_cells(depth, enlargement(depth))
             # Heights in no unit are no ground to drive on.
             return replace(
                 result, image=image, values='picture' if q else 'disparity', survey=None
             )
-        return self._undone(image, enlargement(image), begun)
+        return self._segment_cells(image, enlargement(image), begun)
 
-    def _undone(
-        self, image: RangeImage, cells: Cells | None, begun: Begun | None = None
+    def _segment_cells(
+        self, image: RangeImage, cells: Cells | None, begun: BinsTask | None = None
     ) -> Segmentation:
-        """Segment an image, of which a measurement fills several pixels, `cells`, or one."""
+        """Segment an image whose measurements fill `cells` of pixels, or one pixel each (None)."""
         config = self.config
         if cells is None:
             result = self._find_planes(image, begun)
@@ -115,7 +115,7 @@ class Segmenter:
         survey = replace(Survey.of(image, result.sensor, config), cells=cells)
         labels = cells.enlarged(result.labels, image.shape) * image.valid
         squares = cells._replace(factor=cells.factor * result.side)
-        sensor = result.sensor.every(1 / cells.factor)
+        sensor = result.sensor.rescaled(1 / cells.factor)
         return replace(result.of_pixels(labels, image, squares), survey=survey, sensor=sensor)
 
     def _side(self, image: RangeImage) -> int:
@@ -123,7 +123,7 @@ class Segmenter:
         planes = self.config.method == 'planes'
         return bin_side(image.shape, self.config.work_budget) if planes else 1
 
-    def _find_planes(self, image: RangeImage, begun: Begun | None = None) -> Segmentation:
+    def _find_planes(self, image: RangeImage, begun: BinsTask | None = None) -> Segmentation:
         """Planes of the bins of an image, and labels of its pixels."""
         config, watch = self.config, Stopwatch()
         side = self._side(image)
@@ -137,25 +137,27 @@ class Segmenter:
             valid, errors = labelling.labels > 0, view.sensor
         else:
             labelling = by_normals.segment(view.whole, view.grid, config, watch.lap)
-            # They know no noise: their regions spill by more than a precise sensor errs.
+            # Regions of normals spill over edges by more than the measured errors: use the stated.
             valid, errors = view.whole.valid, SensorModel.from_config(config, image.shape)
-        regions = plane_regions(labelling.labels, valid, view.grid, view.least)
-        # Parts of a plane that holes cut, or that have either of two directions it lies between.
+        regions = plane_regions(labelling.labels, valid, view.grid, view.min_pixels)
+        # Unite parts of a plane that holes separate, or that got two neighbouring directions.
         regions, pairs = unite_regions(regions, view, config.plane_smoothness)
         fits = Fits.of(regions, view.image, errors, view.blocks)
         pixels: Task[Labels] | None = None
         if isinstance(labelling, by_planes.Labelling) and side > 1:
             given = regions, labelling.labels, labelling.models, image, side, sensor
-            pixels = Task(with_sharp_borders, *given, config.plane_smoothness * sensor.patch)
+            pixels = Task(
+                with_sharp_borders, *given, config.plane_smoothness * sensor.pixel_inflation
+            )
         probability = plane_probabilities(fits, pairs, config.plane_prior)
-        # Of directions, all regions are planes.
+        # Method normals drops no region.
         flat = (probability >= config.plane_probability) | (config.method == 'normals')
         flat[0] = True
         numbers = numbers_of(flat)
         curved = None if config.method == 'normals' else relabel(regions, numbers_of(~flat))
         fits, roots = fits.without(~flat), fits.roots()[flat]
         watch.lap('regions')
-        # Bridged pixels were not measured; some regions have no plane, or one without an end.
+        # No labels on bridged pixels, nor on regions without a plane or with one up to infinity.
         names = (fits.farthest() > 0)[numbers] * numbers
         found = Task(lambda: relabel(pixels.result() if pixels else regions * image.valid, names))
         errors = sensor if pixels else errors
@@ -189,7 +191,7 @@ def _binned(image: RangeImage, side: int) -> tuple[Bins, list[Blocks]]:
 
 
 def _preprocessed(
-    image: RangeImage, config: Config, begun: Begun, watch: Stopwatch
+    image: RangeImage, config: Config, begun: BinsTask, watch: Stopwatch
 ) -> tuple[View, SensorModel, GridEdges | None]:
     """What is known of an image's bins before planes are looked for.
 

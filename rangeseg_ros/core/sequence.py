@@ -70,7 +70,7 @@ class SequenceSegmenter:
         before, moved = self.config, config.map_frame != self.config.map_frame
         self._segmenter = Segmenter(config)
         if moved:
-            self.map = self.map.anew('its frame has changed')
+            self.map = self.map.restarted('its frame has changed')
             self._pose = None
         if (config.odometry, config.odometry_frame) != (before.odometry, before.odometry_frame):
             self._odometry, self.motion = PlaneOdometry(config), None
@@ -127,7 +127,7 @@ class SequenceSegmenter:
             config = replace(config, up_sd=up_sd)
         if stamp < self._stamp:
             self._tracker.reset()
-            self.map = self.map.anew('time has gone back')
+            self.map = self.map.restarted('time has gone back')
             self._ground.forget()
             self._pose = None
         # Errors and what is in sight follow from where the sensor is: all is seen from there.
@@ -149,7 +149,7 @@ class SequenceSegmenter:
             self.motion = found.of_origin(image.place)
             if not config.fixed_frame:
                 if not found.held and len(self.map):
-                    self.map = self.map.anew('the odometry lost the camera')
+                    self.map = self.map.restarted('the odometry lost the camera')
                 pose = self.motion.pose.after(sensor)
         self.pose = pose.after(sensor.inverse()) if pose else None
         if pose:

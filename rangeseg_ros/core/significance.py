@@ -23,7 +23,7 @@ def quantile(values: Floats, share: float) -> Floats:
 
 
 def chi2_quantile(freedom: float, level: float = LEVEL) -> float:
-    """Quantile of chi-squared with so many degrees of freedom, few."""
+    """Quantile of chi-squared with `freedom` degrees of freedom."""
     a = freedom / 2
 
     def probability(x: float) -> float:
@@ -33,7 +33,7 @@ def chi2_quantile(freedom: float, level: float = LEVEL) -> float:
 
 
 def f_quantile(freedom: float, others: float, level: float = LEVEL) -> float:
-    """Quantile of the ratio of two mean squares with so many degrees of freedom (F), few."""
+    """Quantile of F, the ratio of two mean squares with these degrees of freedom."""
     a, b = freedom / 2, others / 2
     scale = math.lgamma(a + b) - math.lgamma(a + 1) - math.lgamma(b)
 

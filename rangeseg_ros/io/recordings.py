@@ -211,7 +211,7 @@ class Recording(Closing):
             yield record.topic, record.time, message
 
     def records(self, topics: Collection[str]) -> Iterator[Record | Lost]:
-        """Messages on `topics` as they are stored, else as `messages`."""
+        """Iterate over messages on `topics` as they are stored; order and errors as `messages`."""
         missing = Counter({topic: self.counts[topic] for topic in topics})
         damage, time = '', 0
         for reader in self._readers:

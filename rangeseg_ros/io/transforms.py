@@ -20,7 +20,7 @@ _LOOKED_AT = 10_000
 
 
 class RecordedTransforms(Closing):
-    """What the node would know of frames when an image has waited for them.
+    """Transforms that the node would know after it has waited `tf_timeout` for each image.
 
     All static transforms count from the beginning. Of the others, what was recorded up to
     `timeout` seconds (the parameter `tf_timeout`) after an image is known to it.
@@ -70,7 +70,7 @@ def fixed_frame_of(path: Path) -> str:
     """
     parents: dict[str, str] = {}
     moving: set[str] = set()
-    # What a recording lacks that is cut off is told by whoever reads the images.
+    # If the recording is cut off, whoever reads the images reports it.
     with Recording(path) as recording, suppress(BagError):
         for topic in (STATIC, MOVING):
             for _, message in islice(_messages(recording, topic), _LOOKED_AT):

@@ -1,4 +1,4 @@
-"""YAML and JSON files that people write: small, and not made to be read for ever."""
+"""YAML and JSON files that people write, with limits on their size and nesting."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import yaml
 from rangeseg_ros.io.files import FileError, read_bytes
 
 LARGEST = 2**17
-"""Bytes; of calibrations and parameters a hundred times what they have."""
+"""Largest file, bytes: a hundred times what calibrations and parameters have."""
 
 
 class _Loader(yaml.SafeLoader):

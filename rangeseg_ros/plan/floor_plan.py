@@ -60,7 +60,7 @@ def occupancy(
             (np.abs(above) < band[0], MISS),
         ):
             if chosen.any():
-                grid.reach(some[chosen, :2])
+                grid.extend_to(some[chosen, :2])
                 np.add.at(grid.odds, grid.cells(some[chosen, :2]), change)
     return grid
 
@@ -281,9 +281,9 @@ def _drawn(grid: PlaneGrid, floors: Sequence[MapPlane], walls: Sequence[Wall]) -
     free = [[ring[:, :2] for ring in part] for p in floors for part in p.outline.parts]
     lines = [ends for wall in walls for ends in wall.segments]
     for corners in [ring for part in free for ring in part] + lines:
-        grid.reach(np.concatenate([corners - grid.side, corners + grid.side]))
+        grid.extend_to(np.concatenate([corners - grid.side, corners + grid.side]))
     if not grid.odds.size:
-        grid.reach(np.zeros((1, 2)))
+        grid.extend_to(np.zeros((1, 2)))
     cells = np.where(grid.odds < 0, FREE, UNKNOWN).astype(np.int8)
     cells[grid.fill(free)] = FREE
     cells[grid.odds > -LEAST] = OCCUPIED

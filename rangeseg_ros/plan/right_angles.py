@@ -59,7 +59,7 @@ def square_up(planes: Sequence[MapPlane], covariance: Floats, tolerance: float) 
     equations = known.values.reshape(-1, 4).copy()
     for k, plane in enumerate(planes):
         if exact[k]:
-            # Without what the first order has left.
+            # Set the normal exactly: the update was linear.
             normal = _exact(exact[k], equations[k], equations[seeds.get(k, k)])
             equations[k, 3] += (equations[k, :3] - normal) @ plane.centroid
             equations[k, :3] = normal
@@ -89,7 +89,7 @@ class _Conditions:
         return True
 
     def out_of_square(self, k: int, m: int) -> tuple[Floats, Floats]:
-        """Derivative (1, 4 P) of the difference of two azimuths, and what it lacks (1,)."""
+        """Derivative (1, 4 P) of the difference of two azimuths, and its gap to square (1,)."""
         row, azimuth = np.zeros((1, len(self.values))), []
         for sign, plane in ((1, k), (-1, m)):
             x, y = self.values[4 * plane : 4 * plane + 2]

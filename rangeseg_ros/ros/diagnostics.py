@@ -30,10 +30,10 @@ class FrameTimes:
     stages: dict[str, float]
 
     def values(self, longest_transport: float) -> dict[str, str]:
-        """By name as diagnostics show them; without what other clocks would make of them.
+        """Texts of the times, by name, as diagnostics show them.
 
-        Stamps of recordings, or of clocks that differ, say nothing of the transport: messages do
-        not queue up, so that one which took longer than `longest_transport` ms did not come late.
+        The transport is unknown where it exceeds `longest_transport`, ms: messages do not queue
+        that long, so that stamps are of a recording or of another clock.
         """
         work = self.waiting + self.conversion + self.compute + self.publication
         times = {'latency since arrival': work}
@@ -54,8 +54,8 @@ class Activity:
     def __init__(self) -> None:
         self._doing: dict[int, tuple[float, str]] = {}
 
-    def now(self, what: str = '') -> None:
-        """Have this thread begin something else; nothing while it waits for a frame."""
+    def begin(self, what: str = '') -> None:
+        """Note what this thread does from now on; nothing while it waits for a frame."""
         if what:
             self._doing[get_ident()] = time.monotonic(), what
         else:
@@ -135,7 +135,7 @@ class FrameStatistics:
             ),
             'camera_info': source.pairing if source else '',
             'doing': self.doing() or 'waiting for a frame',
-            'parameters': 'in preparation, those before serve' if self.pending else 'in use',
+            'parameters': 'compiling, former ones in use' if self.pending else 'in use',
             **{f'{what} from': source for what, source in self.sources.items()},
             'input': str(found.verdict) if found else '',
             'planes': str(len(found.planes)) if found else '0',

@@ -1,4 +1,4 @@
-"""Memory that is freed, but that the system does not have back, of glibc's malloc."""
+"""Limits on the memory that glibc's malloc keeps after it was freed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable
 _ARENA_MAX = -8
 
 
-def share_memory() -> None:
+def use_one_arena() -> None:
     """Have all threads that are started from now on take memory from one arena.
 
     By itself glibc gives every thread one of its own, of which it keeps up to 60 MB at the end,

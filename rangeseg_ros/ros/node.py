@@ -43,9 +43,9 @@ from rangeseg_ros.ros.throttled_events import ThrottledCallbackGroup
 _BAD_NAMES = (InvalidNodeNameException, InvalidNamespaceException)
 
 
-# Parameters that decide about the subscriptions to frames, and to their poses.
-_frames = attrgetter('input', 'raw')
-_places = attrgetter('use_imu', 'gravity_frame', 'fixed_frame', 'target_frame')
+# Settings whose change renews the subscriptions to frames, and to poses.
+_input_settings = attrgetter('input', 'raw')
+_pose_settings = attrgetter('use_imu', 'gravity_frame', 'fixed_frame', 'target_frame')
 # Seconds until a listener is noticed while frames come: none that a person would.
 _EVENT_INTERVAL = 0.1
 
@@ -128,7 +128,7 @@ class SegmentPlanes(LifecycleNode):
             answer: ChangeState.Response = self._change_state(request, response)
             return answer
         except RuntimeError:
-            told = f'transition refused: {request.transition} is none of this state'
+            told = f'transition {request.transition.id} is not possible in this state'
             self.get_logger().warning(told)
             response.success = False
             return response
@@ -158,11 +158,11 @@ class SegmentPlanes(LifecycleNode):
         if config is None:
             return
         self._config = config
-        if self._input and _frames(config) != _frames(before):
+        if self._input and _input_settings(config) != _input_settings(before):
             self._unsubscribe()
             self._follow_demand()
         # No frame is lost for it.
-        elif self._input and _places(config) != _places(before):
+        elif self._input and _pose_settings(config) != _pose_settings(before):
             self._pipeline.locator.subscribe(config)
 
     def _follow_demand(self) -> None:

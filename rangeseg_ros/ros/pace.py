@@ -6,16 +6,16 @@ import math
 from collections import deque
 from statistics import median
 
-from rangeseg_ros.core.sensing.binning import STEPS, step_within
+from rangeseg_ros.core.sensing.binning import BUDGETS, widening
 
 # Seconds over which times are smoothed: a single slow frame is not followed, and a change of scene
 # is (95 % after three times as long) within the five seconds over which rates are counted.
 _TIME_CONSTANT = 1.0
-# The 95th percentile of the times of frames, to their median (docs/benchmark.md): so many are in
-# time where the median frame takes this much less than it may.
+# Ratio of the 95th percentile of the times of frames to their median (docs/benchmark.md): 95 % of
+# frames are in time where the median frame is faster than the period by this factor.
 _HEADROOM = 1.15
-# What more work will take is foreseen no better than this: of the shares that are stated and
-# those measured (docs/benchmark.md), and of the times of frames after one time constant.
+# Factor by which the predicted time of a larger share of the work may be wrong: the stated shares
+# differ from the measured ones (docs/benchmark.md), and the filter has not settled.
 _DOUBT = 1.1
 # Seconds for which more work must seem possible before it is done: then 95 % of what is known is
 # of the work that is done.
@@ -35,7 +35,7 @@ class Pace:
 
     def __init__(self, rate: float, most: float) -> None:
         self.rate, self.most = rate, most
-        less = [b for b in STEPS if b < most and step_within(b) != step_within(most)]
+        less = [b for b in BUDGETS if b < most and widening(b) != widening(most)]
         self._steps = [most, *less]
         self._step = 0
         self._period = 1 / (_HEADROOM * rate) if rate else math.inf
@@ -72,5 +72,5 @@ class Pace:
 
 
 def _share(budget: float) -> float:
-    """What `budget` leaves of the work: the largest of the `STEPS` within it, or the smallest."""
-    return next((step for step in STEPS if step <= budget), STEPS[-1])
+    """The share of the work that is done: the largest of the `BUDGETS` within `budget`."""
+    return next((step for step in BUDGETS if step <= budget), BUDGETS[-1])

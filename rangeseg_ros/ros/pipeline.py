@@ -128,7 +128,7 @@ class Pipeline:
     def _segment(self, work: Work) -> Segmented:
         """Do what needs no other frame."""
         config, frame = work.segmenter.config, work.frame
-        doing = self._statistics.activity.now
+        doing = self._statistics.activity.begin
         doing('converting the message')
         ticks = [time.perf_counter()]
         start = self._node.get_clock().now().nanoseconds
@@ -214,7 +214,7 @@ class Pipeline:
     def _refuse(self, problem: str) -> None:
         self._statistics.problem = problem
         self._statistics.answered(self._statistics.refused)
-        self._statistics.activity.now()
+        self._statistics.activity.begin()
         self._node.get_logger().warning(f'frame refused: {problem}', throttle_duration_sec=5.0)
 
     def _fail(self, error: Any) -> None:

@@ -68,13 +68,13 @@ class Publication:
             and now - self._map_time >= _MAP_INTERVAL
             and any(map(self._has_listeners, MAP_OUTPUTS))
         ):
-            self._statistics.activity.now('publishing the map')
+            self._statistics.activity.begin('publishing the map')
             self._map_time = now
             fixed = header_of(make_rclpy, header.stamp, config.map_frame)
             for name, (_, map_message) in MAP_OUTPUTS.items():
                 planes = map_message(make_rclpy, fixed, sequence.map.planes)
                 self._publishers[name].publish(planes)
-        self._statistics.activity.now()
+        self._statistics.activity.begin()
         times = [*ticks, time.perf_counter()]
         conversion, compute, publication = (1000 * (end - begin) for begin, end in pairwise(times))
         waits = (frame.time - frame.stamp) / 1e6, (start - frame.time) / 1e6
@@ -89,7 +89,7 @@ class Publication:
         """Names of the outputs that somebody listens to, each once its kernels are there."""
         for name in self._settings.ready_first(OUTPUTS):
             if self._has_listeners(name):
-                self._statistics.activity.now(f'publishing {name}')
+                self._statistics.activity.begin(f'publishing {name}')
                 if not self._settings.ready_for(name):
                     return
                 yield name

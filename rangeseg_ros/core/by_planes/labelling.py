@@ -19,10 +19,10 @@ from rangeseg_ros.core.runtime.threads import map_halves, run_halves
 from rangeseg_ros.core.sensing.blocks import NODE
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
-# Pixels from a boundary to cut anew: so far may that of blocks lie from that of pixels.
+# Pixels by which a label may expand at once: borders of blocks are off by up to a block.
 _BAND = NODE
-# Blocks around a surface that shifts of its plane are known for.
-_DOMAIN = 4
+# Blocks around a surface where shifts of its plane are computed as well.
+_MARGIN = 4
 
 
 def refine(
@@ -34,9 +34,9 @@ def refine(
     the errors of the image.
     """
     models = Models.of(moments, sensor.distortion_pixels)
-    # Windows as wide as the distortion tell the shifts; larger ones tell those of other places.
+    # Shifts are means over windows as wide as the distortion, within which it hardly changes.
     around = int(sensor.distortion_length / NODE - 1) // 2
-    local = shifts(surfaces, blocks, models.theta, _DOMAIN, around, sensor.agreement)
+    local = shifts(surfaces, blocks, models.theta, _MARGIN, around, sensor.block_inflation)
     models = models._replace(shifts=local)
     labels = np.empty(len(problem.inverse), np.int32)
     # What labels cost is worked out where it is asked for.

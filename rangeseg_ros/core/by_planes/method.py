@@ -1,4 +1,4 @@
-"""Method planes from a range image to a labelling, and to the regions that are flat."""
+"""Method planes: from the view of an image to a labelling."""
 
 from __future__ import annotations
 

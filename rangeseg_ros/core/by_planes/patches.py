@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.arrays import Floats, Indices, Ints, Mask
-from rangeseg_ros.core.by_planes.region_graph import find_roots, renumbered, singles
+from rangeseg_ros.core.by_planes.region_graph import find_roots, make_sets, renumbered
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import NODE, Blocks
 from rangeseg_ros.core.sensing.grid import Grid, View
@@ -22,7 +22,7 @@ from rangeseg_ros.core.sensing.sensor import (
 )
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 
-# Measurements of a block, those of bridged holes included, and without these: a plane has three.
+# Fewest measurements of a block, bridged holes included: a plane has three parameters.
 _LEAST = 3
 # Chi-squared of the three degrees of freedom of a plane.
 _CHI2_LIMIT = chi2_quantile(3)
@@ -116,10 +116,10 @@ def find_patches(nodes: Nodes, sensor: SensorModel) -> tuple[Ints, Floats]:
 
     The patch (rows, columns) of each block, 0 for none, otherwise 1...P, and moments (P + 1, 13).
     """
-    # No patch reaches over the middle, but neither does any reach across a large surface.
-    # Not even in a small image is one smaller than four blocks.
+    # Halves are independent: patches that end at the middle are merged later, to surfaces. Even
+    # in small images a patch may grow to four blocks.
     largest = max(sensor.distortion_pixels, 4.0 * NODE**2)
-    halves = map_halves(_patches, len(nodes.residual), nodes, largest, sensor.agreement)
+    halves = map_halves(_patches, len(nodes.residual), nodes, largest, sensor.block_inflation)
     (upper, first), (lower, second) = halves
     lower[lower > 0] += len(first) - 1
     labels, moments = np.concatenate([upper, lower]), np.concatenate([first, second[1:]])
@@ -128,11 +128,11 @@ def find_patches(nodes: Nodes, sensor: SensorModel) -> tuple[Ints, Floats]:
 
 @njit(cache=True, nogil=True)
 def _patches(
-    first: int, after: int, nodes: Nodes, largest: float, agreement: float
+    first: int, after: int, nodes: Nodes, largest: float, block_inflation: float
 ) -> tuple[Ints, Floats]:
     """Patches of at most `largest` pixels in some rows of blocks, 1...P, and their moments.
 
-    `agreement`: by how much the noise of neighbours exceeds white noise, see `SensorModel`.
+    `block_inflation`: variance of the noise of blocks over that of white noise.
     """
     shape = after - first, nodes.residual.shape[1]
     blocks = nodes.moments[first:after].copy().reshape(-1, SIZE)
@@ -150,7 +150,7 @@ def _patches(
             kept[count], number[a], count = a, count, count + 1
     kept = kept[:count]
     chains = _chains(number[root], smooth.reshape(shape), right, below, count)
-    grown = _grow(blocks[kept], residual[kept], chains, largest, agreement)
+    grown = _grow(blocks[kept], residual[kept], chains, largest, block_inflation)
     for a in range(len(root)):
         if smooth[a]:
             root[a] = kept[grown[number[root[a]]]]
@@ -187,12 +187,12 @@ def _chains(
 
 
 @njit(cache=True, error_model='numpy')
-def _misfit(extra: float, moments: Floats, k: int, m: int, agreement: float) -> float:
+def _misfit(extra: float, moments: Floats, k: int, m: int, block_inflation: float) -> float:
     """Extra chi-squared of one plane for two of the parts (N, 13), in what it may be at most."""
     first, second = moments[k, COUNT], moments[m, COUNT]
     pixels = first + second
     ratio = (moments[k, RATIO] + moments[m, RATIO]) / pixels
-    return extra / (agreement * _CHI2_LIMIT + _GRANTED * ratio * first * second / pixels)
+    return extra / (block_inflation * _CHI2_LIMIT + _GRANTED * ratio * first * second / pixels)
 
 
 @njit(cache=True)
@@ -205,7 +205,7 @@ def _quads(
     the parent of each block.
     """
     rows, columns = smooth.shape
-    parent = singles(rows * columns)
+    parent = make_sets(rows * columns)
     theta, total = np.zeros(3), np.zeros(SIZE)
     whole, side, found = smooth, 1, True
     while found:
@@ -244,7 +244,7 @@ def _grow(
     residual: Floats,
     chains: tuple[NDArray[np.uint32], ...],
     largest: float,
-    agreement: float,
+    block_inflation: float,
 ) -> NDArray[np.uint32]:
     """Merge parts to patches of at most `largest` pixels, the flattest first, each with the
     neighbour it fits best; in place.
@@ -254,7 +254,7 @@ def _grow(
     """
     count, (head, tail, link, target) = len(moments), chains
     parent = np.empty(count, np.uint32)
-    # Those as flat wait in one chain, the first of which has waited longest.
+    # Buckets of equally flat patches, each a queue: first in, first out.
     first, last = np.full(_LEVELS, _NONE), np.full(_LEVELS, _NONE)
     after = np.full(count, _NONE)
     for k in range(count):
@@ -295,7 +295,7 @@ def _grow(
                 if moments[a, COUNT] + moments[b, COUNT] <= largest:
                     common = common_residual(moments, int(np.intp(a)), int(np.intp(b)))
                     extra = common - residual[a] - residual[b]
-                    apart = _misfit(extra, moments, a, b, agreement)
+                    apart = _misfit(extra, moments, a, b, block_inflation)
                     if apart < best:
                         best, partner, together = apart, b, common
             e = following
@@ -319,7 +319,7 @@ def _wait(
     last: NDArray[np.uint32],
     after: NDArray[np.uint32],
 ) -> int:
-    """Let a patch of such a mean residual wait behind those as flat; the number of its chain."""
+    """Append a patch of such a mean residual to the queue of its bucket; the bucket's number."""
     level = int(min(residual * _PER_VARIANCE, _LEVELS - 1.0))
     if first[level] == _NONE:
         first[level] = a

@@ -48,7 +48,7 @@ class Problem(NamedTuple):
         neighbours.
         """
         inverse, rays = image.inverse.ravel(), image.rays.reshape(-1, 3)
-        prior = link_costs(grid, smoothness * sensor.patch)
+        prior = link_costs(grid, smoothness * sensor.pixel_inflation)
         weight = _weights(inverse, sensor)
         return cls(inverse, rays, image.pinhole, weight, prior, image.shape[1])
 

@@ -49,10 +49,10 @@ def plane_probabilities(fits: Fits, pairs: Labels, prior: float) -> Floats:
     regions: the result where nothing tells. 0 for region 0.
     """
     sums, sensor = fits.sums, fits.sensor
-    # The planes of least squares in inverse range: what those of clouds leave, which are of total
-    # least squares, is no bend to a scanner, whose planes are not linear in the pixels.
+    # Fitted anew, in inverse range: the planes of clouds are of total least squares, and what they
+    # leave in inverse range would look like a bend. A plane of a scanner is not linear in pixels.
     total = np.concatenate([fits.total, fits.total[pairs].sum(axis=1)])
-    known = fit_sums(total), sensor, sensor.correlated, prior
+    known = fit_sums(total), sensor, sensor.region_inflation, prior
     # Of a pair the larger region first, whose numbers are lower: places are told from its middle.
     return _probabilities(sums, np.sort(pairs).astype(np.intp), total, *known)
 
@@ -79,7 +79,7 @@ def _probabilities(
             continue
         one, other = _evidence(sums, a, b, theta, sensor, alike)
         for k, own, further in ((a, one, other), (b, other, one)):
-            # Against two planes, and against a plane beside a surface that goes on as its own.
+            # The alternatives: both are planes; or this one is, and only the other is curved.
             share, p = 1 / (1 + np.exp(-own) + np.exp(-own - further)), count + e
             if share > shared[k]:
                 both = _probability(sums, a, b, total[p], theta[p], sensor, alike, prior)

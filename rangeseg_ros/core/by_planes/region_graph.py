@@ -99,7 +99,7 @@ def absorb(contacts: Contacts, strips: Floats, apart: Floats, a: int, b: int) ->
 
 
 @njit(cache=True)
-def singles(count: int) -> Indices:
+def make_sets(count: int) -> Indices:
     """Parents of nodes that are roots: their own numbers. `np.arange` compiles for a second."""
     parent = np.empty(count, np.intp)
     for a in range(count):

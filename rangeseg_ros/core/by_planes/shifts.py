@@ -38,7 +38,7 @@ class Shifts(NamedTuple):
 
 
 def shifts(
-    surfaces: Ints, blocks: Floats, theta: Floats, reach: int, around: int, agreement: float
+    surfaces: Ints, blocks: Floats, theta: Floats, reach: int, around: int, block_inflation: float
 ) -> Shifts:
     """Shifts of planes (K + 1, 3) to the blocks of their surfaces (rows, columns), 0 for none.
 
@@ -54,7 +54,9 @@ def shifts(
     end = np.cumsum(extent.prod(axis=1))
     start = end - extent.prod(axis=1)
     local = Shifts(np.hstack([corner, extent]), start, np.zeros(end[-1], np.float32))
-    map_halves(_find_shifts, len(theta), local, _inner(surfaces), blocks, theta, around, agreement)
+    map_halves(
+        _find_shifts, len(theta), local, _inner(surfaces), blocks, theta, around, block_inflation
+    )
     return local
 
 
@@ -86,7 +88,7 @@ def _find_shifts(
     blocks: Floats,
     theta: Floats,
     around: int,
-    agreement: float,
+    block_inflation: float,
 ) -> None:
     """Fill in the shifts of planes first...after, from sums over windows of blocks."""
     window = np.empty(3)
@@ -120,4 +122,4 @@ def _find_shifts(
                 leaves, weight, ratio = window
                 # What is left of none is rounding.
                 if weight > 1e-9 * total[rows, columns, 1]:
-                    result[i, j] = leaves / weight * ratio / (ratio + agreement)
+                    result[i, j] = leaves / weight * ratio / (ratio + block_inflation)

@@ -21,8 +21,8 @@ from rangeseg_ros.core.by_planes.region_graph import (
     absorb,
     find_contacts,
     find_roots,
+    make_sets,
     renumbered,
-    singles,
 )
 from rangeseg_ros.core.regions import by_falling_size, relabel
 from rangeseg_ros.core.sensing.blocks import NODE
@@ -43,15 +43,14 @@ _PLANE = chi2_quantile(3) / 2
 class Expected(NamedTuple):
     """What is expected of parts of one surface.
 
-    Of the sensor `smooth`, its `distortion_pixels`, `agreement` and `patch`; the pixels of a
-    `unit` of the length of borders, and what one costs in the energy (`border`); the mean square
-    by which planes bend for each pixel that they are large, in squares of their inverse range
-    (`bend`).
+    Of the sensor `smooth`, its `distortion_pixels`, and two of its inflations. Lengths of borders
+    are counted in `unit` pixels, of which each costs `border` in the energy. `bend` is the mean
+    square by which planes bend per pixel of their size, over their squared inverse range.
     """
 
     smooth: float
-    agreement: float
-    patch: float
+    block_inflation: float
+    pixel_inflation: float
     unit: float
     border: float
     bend: float
@@ -59,9 +58,10 @@ class Expected(NamedTuple):
     @classmethod
     def of(cls, view: View, unit: int, smoothness: float) -> Expected:
         """Of parts of an image, their borders counted in units of so many pixels."""
-        smooth, patch = view.sensor.distortion_pixels, view.sensor.patch
-        border, bend = float(smoothness * patch * unit), PLANE_BEND**2 * view.area
-        return cls(smooth, view.sensor.agreement, patch, float(unit), border, bend)
+        sensor, smooth = view.sensor, view.sensor.distortion_pixels
+        border, bend = float(smoothness * sensor.pixel_inflation * unit), PLANE_BEND**2 * view.area
+        inflation = sensor.block_inflation, sensor.pixel_inflation
+        return cls(smooth, *inflation, float(unit), border, bend)
 
 
 def join_surfaces(
@@ -75,7 +75,7 @@ def join_surfaces(
     """
     expected = Expected.of(view, NODE, smoothness)
     roots, _ = _agglomerate(patches, nodes.right, nodes.below, moments, expected)
-    least = max(view.least**0.5 - NODE, 2 * NODE) ** 2
+    least = max(view.min_pixels**0.5 - NODE, 2 * NODE) ** 2
     surface, moments = renumbered(roots, moments, least)
     return surface[patches], moments
 
@@ -103,7 +103,7 @@ def _agglomerate(
     Returns the root (P + 1,) of each, and the pairs (E, 2) of parts that touch and are not merged.
     """
     contacts = find_contacts(labels, right, below, len(moments))
-    moments, parent = moments.copy(), singles(len(moments))
+    moments, parent = moments.copy(), make_sets(len(moments))
     residual = fit_all(moments)[1]
     length, target = contacts.length, contacts.target
     # Of half-edges: moments of the patches along the border. Of contacts: how far two parts are
@@ -162,14 +162,14 @@ def _apart(
     pixels = moments[a, COUNT] + moments[b, COUNT]
     ratio = (moments[a, RATIO] + moments[b, RATIO]) / pixels
     granted = 1 + ratio * distortion_share(pixels, expected.smooth)
-    change = (0.5 * extra / granted - expected.border * length) / expected.patch
+    change = (0.5 * extra / granted - expected.border * length) / expected.pixel_inflation
     costs, fits = 1 + change / _PLANE, _misfit(extra, moments, a, b, expected.bend, expected)
     if fits >= min(costs, 1):
         # However well the patches along the border fit.
         return costs
     own = (common_residual(strips, h, h) + common_residual(strips, h + 1, h + 1)) / 2
     crease = common_residual(strips, h, h + 1) - own
-    # What bends evenly over the parts bends by the square of a length over a strip.
+    # Deviations of an evenly curved surface grow as the length squared, their squares as area^2.
     near = expected.bend * (strips[h, COUNT] + strips[h + 1, COUNT]) / pixels
     return min(max(fits, _misfit(crease, strips, h, h + 1, near, expected)), costs)
 
@@ -184,7 +184,7 @@ def _misfit(
     ratio = (moments[k, RATIO] + moments[m, RATIO]) / pixels
     smoothly = pixels * distortion_share(pixels, smooth)
     smoothly -= first * distortion_share(first, smooth) + second * distortion_share(second, smooth)
-    # A bend grows with the width of a plane, its mean square with the area: N (N) - n (n) - m (m).
+    # Sums of squares of a bend grow as pixels^2: N^2 - n^2 - m^2 = 2 n m more than in the parts.
     squares = moments[k, CHI2] + moments[m, CHI2]
     bent = bend * squares * 2 * first * second / pixels
-    return extra / (_NOISE * expected.agreement + _WITHIN * (ratio * smoothly + bent))
+    return extra / (_NOISE * expected.block_inflation + _WITHIN * (ratio * smoothly + bent))

@@ -33,8 +33,8 @@ _VIEW, _FEWEST_VIEWS = 0.1, 3
 _STEP = 8.0
 _SMOOTHNESS = ((4096.0,), (512.0,), (64.0,), (8.0,))
 _SLOPES = (512.0, 64.0)
-# Cells over which the uncertainty is averaged: of four degrees of freedom much is chance, and what
-# is low by chance would be trusted most.
+# Cells over which the uncertainty is averaged: that of one cell has four degrees of freedom only,
+# and a value that is low by chance would be trusted most.
 _AVERAGED = 5.0
 ADVICE = (
     'record walls, floor and other flat things for half a minute while the camera moves slowly: '
@@ -162,7 +162,7 @@ def _check(seen: Sightings, views: Indices) -> None:
 
 
 def _settled_weights(seen: Sightings, grid: tuple[int, int]) -> Floats:
-    """Weights (N,) by what a field leaves whose own weights know of none."""
+    """Weights (N,) by the residuals of a field that was solved with weights by no field."""
     weight = robust_weights(seen, 0.0)
     (field,) = solve(seen, np.ones((1, len(weight))), weight, grid, _SMOOTHNESS[1])
     return robust_weights(seen, field[seen.cell])

@@ -76,9 +76,9 @@ def find_sightings(labels: Labels, image: RangeImage) -> Sightings:
     height, width = labels.shape
     cells = np.arange(height)[:, None] // size * columns + np.arange(width) // size
     kernel = np.ones((2 * _RIM + 1, 2 * _RIM + 1), np.uint8)
-    inner = (labels > 0) & image.valid & (image.along > 0)
+    inner = (labels > 0) & image.valid & (image.depth_over_range > 0)
     inner &= cv2.erode(labels, kernel) == cv2.dilate(labels, kernel)
-    along = np.where(inner, image.along, 1).astype(np.float64)
+    along = np.where(inner, image.depth_over_range, 1).astype(np.float64)
     inverse, rays = image.inverse / along, image.rays / along[..., None]
     kept, means = [np.zeros(0, np.intp)], [np.zeros((0, 4))]
     for label in range(1, int(labels.max(initial=0)) + 1):

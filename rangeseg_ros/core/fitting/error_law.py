@@ -77,12 +77,12 @@ class Strata(NamedTuple):
 
 
 def fit_law(strata: Strata, shown: Floats, known: Floats, like: Law) -> Law:
-    """The law that with what is `known` explains the variances (S,) that strata show.
+    """Fit a law to variances (S,) `shown` by strata, of which `known` (S,) is explained already.
 
-    Constant in disparity or, if that explains them better, in range: of both together a few
-    blocks tell nothing, and of one stratum it is of the kind of another law, `like`. First of
-    surfaces that face the sensor: noise makes slopes of its own, which would explain it. Then
-    slopes explain what is left where that is no chance.
+    The noise is constant in disparity or in range, whichever fits better: few blocks cannot tell
+    a mixture, and one stratum cannot tell which (then as in `like`). It is fitted to the strata of
+    least slope, as noise makes slopes of its own. Then a term in the slope is fitted to all
+    strata, and kept if it is significant.
     """
     facing = np.arange(0, len(shown), strata.slopes)
     quartic = strata.squared[facing] ** 2
@@ -92,8 +92,8 @@ def fit_law(strata: Strata, shown: Floats, known: Floats, like: Law) -> Law:
     in_range = other < deviance if len(facing) > 1 else like.quartic > 0
     law = Law(0.0, factor) if in_range else Law(constant, 0.0)
     known = known + law.facing(strata.squared)
-    # A deviation is off by half of what its square is. Strata that differ tell by how much, in the
-    # median, as clutter fills some.
+    # Standard error from the scatter of the strata, by medians as clutter fills some. The relative
+    # error of a deviation is half of that of a variance.
     ratio = shown / known
     spread = quantile(np.abs(ratio - quantile(ratio, 0.5)), 0.5) / _MEDIAN
     law = law._replace(error=float(spread / (2 * len(shown) ** 0.5)))

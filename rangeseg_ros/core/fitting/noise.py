@@ -72,8 +72,8 @@ def measured_sensor(
 
     `quanta` are the steps that it is rounded to, see `quantisation`.
     """
-    # Smaller blocks would not do: rounding hides in those that it rounds alike, and noise makes
-    # slopes of its own.
+    # Not scales[0]: blocks that round to a single value hide the noise, and in small blocks noise
+    # alone makes slopes.
     coarse = scales[1]
     count = coarse.moments[..., COUNT]
     used = np.flatnonzero(2 * count >= count.max())
@@ -84,7 +84,7 @@ def measured_sensor(
     rounding = max(quantum / np.sqrt(12), _EXACT)
     range_rounding = range_quantum / np.sqrt(12)
     least = Law(rounding**2, range_rounding**2)
-    used = _some(used, _MOST)
+    used = _thinned(used, _MOST)
     freedom = np.maximum(count - 3, 1)
     mean_square = coarse.residual / (freedom * _share(_median(freedom, used)))
 
@@ -119,10 +119,10 @@ def _over_scales(
 ) -> tuple[list[float], float, float, Law, float] | None:
     """What blocks of 4, 8, 16, ... pixels show, as long as there are enough of them.
 
-    V(4), V(8), ... relative to `noise`, what 8 pixels show; M(8) relative to it; the measured
-    share of most blocks; the largest distortion of any scale, and what share of it the smallest
-    shows. None where too few are flat. Noise is the `least` at least; what bends by more than the
-    `prior` allows is more than one surface.
+    V(4), V(8), ... over `noise`, the law of 8 pixels, and M(8) over it; the share of pixels
+    measured in most blocks; the law of the largest distortion of all scales; the share of its
+    variance in the smallest blocks. None where too few blocks are flat. `least` is the lowest
+    noise. Blocks that bend by more than the `prior` allows are taken for several surfaces.
     """
     blocks = scales[0]
     level = noise.variances(scales[1]).repeat(2, axis=0).repeat(2, axis=1)
@@ -132,7 +132,7 @@ def _over_scales(
     flat = (count >= 6) & (blocks.residual < ROUGH * level * np.maximum(count - 3, 1))
     if not flat.any():
         return None
-    used = _some(np.flatnonzero(flat), _ENOUGH)
+    used = _thinned(np.flatnonzero(flat), _ENOUGH)
     strata = Strata.of(blocks, used)
     within = [_ratio(blocks, level, used, strata)]
     # What is new in every pixel shows in the smallest blocks, but for what numbers are rounded by.
@@ -145,7 +145,7 @@ def _over_scales(
         used = np.flatnonzero(whole)
         if len(used) < SAMPLES:
             break
-        used = _some(used, _ENOUGH)
+        used = _thinned(used, _ENOUGH)
         strata = Strata.of(larger, used)
         level = sum_of_four(level) / 4
         excess = np.maximum(larger.residual - sum_of_four(blocks.residual), 0) / (9 * _MEDIAN)
@@ -161,19 +161,19 @@ def _over_scales(
         typical.append(8 / pixels * float(quantile(bend.facing(ranges), 0.5)))
         if typical[-1] == max(typical):
             distortion = bend.times(8 / pixels)
-        # What one surface leaves where the sensor errs by as much as the prior allows. No less: of
-        # a bent one, only what happens to be flat would be left to tell the distortion.
+        # Keep what bends by at most four standard deviations of the prior's distortion. A lower
+        # limit would keep only the flattest blocks, and their distortion would be too small.
         allowed = OUTLIER**2 * systematic_variance(prior, larger.squared) * pixels / 8
         flat = whole & (excess < _BENT * (expected + allowed))
     if not typical:
         return None
-    rounding = float(quantile(least.facing(ranges), 0.5))
-    unbent = max(typical[0], rounding) / max(*typical, rounding)
-    # Less of a difference is chance.
+    lowest = float(quantile(least.facing(ranges), 0.5))
+    unbent = max(typical[0], lowest) / max(*typical, lowest)
+    # A smaller difference may be chance.
     return within, between, filled, distortion, unbent if CLEARLY * unbent < 1 else 1.0
 
 
-def _some(used: Indices, most: int) -> Indices:
+def _thinned(used: Indices, most: int) -> Indices:
     """Every n-th of N numbers: about as many as `most`."""
     # Odd, as rows of blocks are rarely odd: not the same columns of every row.
     return used[:: max(len(used) // most, 1) | 1]

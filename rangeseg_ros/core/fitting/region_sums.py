@@ -60,13 +60,13 @@ class Layout(NamedTuple):
 
 
 class RegionSums(NamedTuple):
-    """Sums over regions 0...M, without outliers."""
+    """Sums over regions 0...M, without outliers unless these are the majority."""
 
     box: Indices  # (M + 1, 4), see `Layout`
     start: Indices  # (M + 2,), where each region's cells begin in `cells`
     cells: Floats  # (N, 29), those with pixels, see `RECORD`
     pixels: Indices  # (M + 1,), number of measured pixels
-    outliers: Indices  # (M + 1,), and of those that were left out
+    outliers: Indices  # (M + 1,), of these far from the plane; left out unless they are most
 
     @property
     def owners(self) -> Indices:

@@ -28,21 +28,21 @@ class Steps(NamedTuple):
 def jump_steps(blocks: Blocks, sensor: SensorModel) -> Steps:
     """Smallest step of the inverse range that is a jump, and the slope of the surface.
 
-    Second differences of means of 3 x 3 pixels, that jump edges are found by, have 0.72 times the
-    variance of `agreement` (0.67 to 0.76), and five standard deviations are no noise. Rounding
-    alone makes steps of one quantum, and of two where noise adds to it.
+    Second differences of means of 3 x 3 pixels, that jump edges are found by, have 0.72 (0.67 to
+    0.76) times the variance of `block_inflation`, and five standard deviations are no noise.
+    Rounding alone makes steps of one quantum, and of two where noise adds to it.
     """
     squared, slope = blocks.squared, blocks.slope
     variance, freedom = random_variance(sensor, squared), blocks.moments[..., COUNT] - 3
     limit = ROUGH * (variance + tilt_variance(sensor, slope)) * freedom
     flat = (freedom > 0) & (blocks.residual < limit)
-    # That of a block that a jump crosses is the jump's: its neighbours' then.
+    # A jump distorts the slope of its block: take those of flat blocks beside it.
     around = np.ones((3, 3), np.uint8)
     least = np.where(flat, slope, cv2.erode(np.where(flat, slope, np.inf), around))
     most = np.where(flat, slope, cv2.dilate(np.where(flat, slope, 0.0), around))
     least[cv2.dilate(flat.astype(np.uint8), around) == 0] = 0.0
     rounding = 2.2 * np.maximum(sensor.quantum, sensor.range_quantum * squared)
-    factor = 25 * 0.72 * sensor.agreement
+    factor = 25 * 0.72 * sensor.block_inflation
     windows, pixels = (
         np.maximum(np.sqrt(factor * (variance + tilt_variance(sensor, added))), rounding)
         for added in (least, most)

@@ -1,8 +1,8 @@
 """How far fitted planes may be off: sandwich covariances from the sensor's errors.
 
-They are white, or Gaussian fields of correlation exp(-|i - j|^2 / (4 sigma^2)), sigma the width of
-the kernel they look smoothed with. Their sum over pairs of pixels is taken over pairs of cells,
-whose pixels spread like a Gaussian of their variance: then its mean has a closed form.
+These errors are white, or Gaussian fields of correlation exp(-|i - j|^2 / (4 sigma^2)), with
+sigma the width of the kernel they look smoothed with. Sums over pairs of pixels are taken over
+pairs of cells, with a Gaussian of the variance of their places: these have a closed form.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def covariance_roots(
     place[:, 2:] = np.maximum(place[:, 2:] - place[:, :2] ** 2, 0)
     for field in ((sensor.correlation, *noise), (sensor.distortion_length, *distortion)):
         if field[1] + field[2] > 0:
-            # A model whose numbers are given as integers is one of numbers all the same.
+            # float(): integers in a SensorModel would compile the kernel once more.
             half = _halves(sums, level, place, *map(float, field))
             middle += half + half.transpose(0, 2, 1)
     return roots(inverse, middle)
@@ -55,8 +55,8 @@ def levels(sums: RegionSums, theta: Floats) -> Floats:
 def roots(outer: Floats, middle: Floats) -> Floats:
     """R (N, m, 3) with R R^T = outer middle outer^T, of `outer` (N, m, 3) and `middle` (N, 3, 3).
 
-    So no rounding that `outer` magnifies makes a variance negative. What rounding has made of
-    directions without variance is left out.
+    No rounding error that `outer` magnifies can make R R^T negative. Directions whose variance is
+    not positive after rounding are left out.
     """
     return outer @ _cholesky(middle)
 
@@ -109,7 +109,7 @@ def _halves(
             cell, own = sums.cells[i], constant + quartic * level[i] ** 4
             for p in range(3):
                 ray[i, p] = np.sqrt(own) * cell[RAY + p]
-            # As far as the field is narrower than the cell, it varies within.
+            # The part of the field that varies within the cell.
             total = (variance + 2 * place[i, 2]) * (variance + 2 * place[i, 3])
             alike = max(cell[COUNT] * variance / np.sqrt(max(total, 1e-300)), 1.0)
             spread = (place[i, 2] + place[i, 3]) / 2

@@ -2,7 +2,7 @@
 
 The energy is E(f) = sum_p D_p(f_p) + lambda sum_pq u_pq [f_p != f_q]. D_p is the data cost of each
 method: `by_normals.labelling`, `by_planes.plane_energy`. The other sum is the Potts prior over the
-grid, with the neighbourhood weights u of `Grid`. Sites are pixels, numbered in raster order.
+grid, with the neighbourhood weights u of `Grid`. Sites, in raster order, are pixels or squares.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ Sites = tuple[NDArray[np.int64], Ints]
 
 
 class GridLabelling(NamedTuple):
-    """A labelling of n pixels, in raster order, while expansions change it."""
+    """A labelling of n sites, in raster order, while expansions change it."""
 
     labels: Ints  # (n,)
-    data: Singles  # (n,), data cost of each pixel's label
+    data: Singles  # (n,), data cost of each site's label
     links: Singles  # (2, n), see `link_costs`
-    width: int  # pixels in a row
+    width: int  # sites in a row
     position: Ints  # (n,), scratch of the expansions: -1 between them
 
     @classmethod

@@ -19,8 +19,9 @@ from rangeseg_ros.core.config import Config
 # Metres of ground, from where it begins, that are continued to below the camera: each doubles the
 # one before. A short one is right where a ramp begins, a long one where the ground undulates.
 _WAYS = (0.4, 0.8, 1.6, 3.2)
-# How often there is a step out of view between a robot and the ground it sees, and the highest.
-STEPS, HIGHEST = 0.1, 0.35
+# Prior probability of a step out of view between the robot and the ground it sees, and the height
+# of the highest one, metres.
+STEP_PRIOR, HIGHEST_STEP = 0.1, 0.35
 
 
 class Stand(NamedTuple):
@@ -59,11 +60,11 @@ class Continuation(NamedTuple):
 def no_step(a: float, sd: float, least: float) -> float:
     """Probability that ground `a` metres off the stated one, +- `sd`, is no step of `least`.
 
-    By Bayes' rule: one ground in `STEPS` lies behind a step that is uniform up to `HIGHEST`.
+    By Bayes' rule: a share `STEP_PRIOR` of grounds lies behind a step, uniform to `HIGHEST_STEP`.
     """
-    same = (1 - STEPS) * math.exp(-((a / sd) ** 2) / 2) / (sd * math.sqrt(2 * math.pi))
+    same = (1 - STEP_PRIOR) * math.exp(-((a / sd) ** 2) / 2) / (sd * math.sqrt(2 * math.pi))
     tails = sum(math.erfc((least - side * a) / (sd * math.sqrt(2))) / 2 for side in (-1, 1))
-    step = STEPS * tails / (2 * max(HIGHEST - least, least))
+    step = STEP_PRIOR * tails / (2 * max(HIGHEST_STEP - least, least))
     return same / (same + step) if same > 0 else 0.0
 
 

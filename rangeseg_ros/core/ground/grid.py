@@ -35,7 +35,7 @@ class GroundGrid(NamedTuple):
     variance : (N, N) float32
         Of the height, square metres.
     age : (N, N) float32
-        Seconds since the cell was seen; inf for never.
+        Seconds since the cell was seen; inf where it is not known, never seen or too long ago.
     resolution : float
         Side of a cell, metres.
     origin : (3,) float64
@@ -83,7 +83,7 @@ class GroundMemory:
         self._height_found, self._height_stamp = height, stamp
 
     def _forget_grid(self) -> None:
-        """Have layers (5, N, N) of nothing: odds, height, variance, danger, second last seen."""
+        """Set empty layers (5, N, N): odds, height, variance, danger, time last seen (s)."""
         count = max(round(self.config.grid_size / self.config.grid_resolution), 1)
         self._layers = np.zeros((5, count, count))
         self._layers[4] = -np.inf

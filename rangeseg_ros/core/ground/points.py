@@ -37,10 +37,10 @@ def drops(image: RangeImage, terrain: Terrain) -> Singles:
 def unseen(image: RangeImage, terrain: Terrain) -> Singles:
     """Crossings of rays without a measurement, as `_crossings`.
 
-    As far as ground is seen, reached or not, and not nearer: no sensor sees below its own nearest
-    or farthest range. Not where the robot's own body is in the way. Single pixels do not count:
-    sensors miss some everywhere. Clouds do not tell the rays of what they have not measured:
-    those between measured points, where their grid is smooth (see `completed_rays`).
+    Points lie within the least and greatest range at which measured pixels are ground or unknown,
+    as sensors have a nearest and a farthest range. Pixels of the robot's body do not count, nor do
+    single missing pixels, which all sensors have. Clouds have no rays of missing points: rays are
+    interpolated between measured points where the grid is smooth (see `completed_rays`).
     """
     seen = image.inverse[(terrain.classes <= GROUND) & image.valid]
     missing = ~image.valid if image.body is None else ~(image.valid | image.body)

@@ -1,10 +1,9 @@
-"""Ground is reached: a chain of seen ground, link by link, leads from the robot to it.
+"""Ground is reached if a chain of ground cells leads from the robot to it.
 
-Cells beside no step and on no slope are looked at from near to far. What is reached already
-predicts the next cell: the mean height of what was reached last in its own column and those beside
-it, an exponential moving average along each. A chain so goes around what stands in its way. What
-is off the ground in its column goes on to be, until it has come back to it: noise that hides an
-edge farther away leads no chain across.
+Cells beside no step and on no slope are visited from near to far. The expected height of a cell is
+the mean of the cells reached last in its own column and those beside it, where each column keeps
+an exponential moving average: so a chain can go around an obstacle. The offset of a column that
+leaves the ground fades with distance: noise that hides an edge farther away leads no chain across.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from numba import njit
 
 from rangeseg_ros.core.arrays import Floats, Mask
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.ground.estimate import HIGHEST
+from rangeseg_ros.core.ground.estimate import HIGHEST_STEP
 from rangeseg_ros.core.runtime.threads import Task
 from rangeseg_ros.core.significance import CLEARLY, OUTLIER
 
@@ -40,7 +39,7 @@ def reach(place: Floats, variance: Floats, config: Config) -> Mask:
         return reached
     # Where the ground comes into view, no farther than the robot is wide from the nearest of it,
     # and no step above or below most of that. It is near height 0, if anything is.
-    begin = even & (np.abs(place[0]) < HIGHEST)
+    begin = even & (np.abs(place[0]) < HIGHEST_STEP)
     begin = begin if begin.any() else even
     front, columns = begin.argmax(axis=0), np.arange(even.shape[1])
     h, x, y = place[:, front, columns]

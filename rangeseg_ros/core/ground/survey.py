@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.ground.estimate import STEPS
+from rangeseg_ros.core.ground.estimate import STEP_PRIOR
 from rangeseg_ros.core.ground.grid import GroundGrid, GroundMemory
 from rangeseg_ros.core.ground.roles import unit
 from rangeseg_ros.core.ground.terrain import Terrain, terrain_of
@@ -58,7 +58,7 @@ class Survey:
             found = found._replace(classes=pixels[0], height=pixels[1])
         if found.stand.found and self.sensor_height <= 0:
             # Nothing that is stated rules out a step out of view.
-            found = found._replace(stand=found.stand._replace(confidence=1 - STEPS))
+            found = found._replace(stand=found.stand._replace(confidence=1 - STEP_PRIOR))
         if found.stand.found:
             self.memory.keep_height(found.stand.height(self.up), self.stamp)
         return found

@@ -1,7 +1,7 @@
 """What the pixels of an image are to a robot: ground, in the way, or below.
 
 One estimate of the ground under the robot (`estimate`), one reachability (`reach`), the ground
-continued (`field`), and heights above it.
+continued (`ground_field`), and heights above it.
 """
 
 from __future__ import annotations
@@ -25,18 +25,17 @@ from rangeseg_ros.core.ground.cells import (
     classify,
     ground_field,
 )
-from rangeseg_ros.core.ground.estimate import HIGHEST, Continuation, Stand, continued
+from rangeseg_ros.core.ground.estimate import HIGHEST_STEP, Continuation, Stand, continued
 from rangeseg_ros.core.ground.reach import reach
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
-# Standard deviations of the noise within which the ground is the ground, and beyond which it is
-# known to be none.
+# Standard deviations of noise: the ground errs by no more, and what errs by more is none.
 _CERTAIN = 3.0
 # Cells among which noise keeps some out of a chain, and over which relief is measured.
 _AROUND = np.ones((5, 5), np.uint8)
 SURE = 0.99
-"""Confidence from which on the ground is the ground; less is unknown."""
+"""Least confidence with which ground counts as ground; with less, it is unknown."""
 FURNITURE = 1.5
 """Metres: what is longer, along or across the view, is no table (without a stated height)."""
 
@@ -159,7 +158,7 @@ def _nearest(above: Floats) -> float:
 def _contradiction(height: float, seen: Continuation | None) -> str:
     """What a stated height, metres, and the ground that is seen say of each other."""
     if seen is None:
-        return f'no ground that is seen is {height:.2f} m below, as is known'
+        return f'no ground is seen {height:.2f} m below, the height that is stated or remembered'
     off, below = abs(seen.plane[0]), height - seen.plane[0]
     why = f'the stated height is {height:.2f} m, the ground seen is {below:.2f} m below'
     if off > _CERTAIN * seen.error:
@@ -216,7 +215,7 @@ def _without_ground(
     obstacle = _faces(cells, config)
     if height > 0:
         # What is higher than any step is none, nor the ground by a wrong height.
-        apart = abs(seen.plane[0]) if seen and seen.plane[0] < HIGHEST else 0.0
+        apart = abs(seen.plane[0]) if seen and seen.plane[0] < HIGHEST_STEP else 0.0
         distance = np.hypot(cells.place[1], cells.place[2])
         error = height_sd + np.radians(config.up_sd) * distance
         bound = config.obstacle_height + apart + _CERTAIN * error

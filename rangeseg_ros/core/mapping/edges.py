@@ -20,8 +20,8 @@ from rangeseg_ros.core.significance import CAUCHY, chi2_quantile
 
 # Points that tell the direction of an edge.
 _NEIGHBOURS = 8
-# Points that err as one, as those along an edge do: so NEES is about 1 in simulated rooms.
-_TOGETHER = 32
+# Points along an edge taken as fully correlated; NEES is then about 1 in simulated rooms.
+_CORRELATED = 32
 _ROUNDS, _GATE = 4, chi2_quantile(1)
 _DEVIATION = 1.4826  # of Gaussian errors, over their median absolute value
 
@@ -86,7 +86,7 @@ class JumpPoints(NamedTuple):
             # As seen from the poses that were given.
             gap += slope @ error
             known = gap**2 < _GATE * expected
-            weight *= known / (_TOGETHER * deviation**2)
+            weight *= known / (_CORRELATED * deviation**2)
             scale, axes = np.linalg.eigh((slope * weight[:, None]).T @ slope)
             told = scale > 1e-9 * scale[-1]
             design = np.sqrt(scale[told])[:, None] * axes.T[told]

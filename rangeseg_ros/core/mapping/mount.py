@@ -48,9 +48,9 @@ class Mount(NamedTuple):
 def mount_of(planes: Sequence[MapPlane], frames: int, tolerance: float) -> Mount | None:
     """The mount by the floor among planes that were fused in the optical frame.
 
-    The floor is the largest plane that faces up; of a robot that drives on a flat floor, it alone
-    stays where it is. None when nothing faces up. `frames` is the number of frames the planes are
-    from, `tolerance` the parameter `role_tolerance`, degrees.
+    The floor is the plane that faces up with the largest area times number of observations, as the
+    floor alone stays where it is when a robot drives on it. None when nothing faces up. `frames`
+    is the number of frames the planes are from, `tolerance` is `role_tolerance`, degrees.
     """
     facing = [plane for plane in planes if -plane.normal[1] > np.cos(_STEEPEST)]
     weight = [plane.area * plane.observations for plane in facing]

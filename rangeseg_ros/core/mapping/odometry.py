@@ -17,7 +17,7 @@ observation is, as error of that plane with the axes e1', e2',
 
     (a - e2' theta, b + e1' theta, c + n shift + (p' x n') theta) + v.
 
-Nothing holds what the pose and all planes have in common, so the error of the pose grows with
+Nothing measures the error that the pose and all planes have in common: that of the pose grows with
 every plane that goes and every new one that comes. Planes out of sight are forgotten: found again,
 they would move the pose at once, and odometry never jumps (REP 105).
 """
@@ -48,8 +48,8 @@ from rangeseg_ros.core.rotations import cross_matrix, rotation_by
 from rangeseg_ros.core.tracking.plane_errors import GATE, congruent, mahalanobis
 from rangeseg_ros.core.tracking.tracker import NOMINAL, PERSISTENCE
 
-# Planes that count, the largest in the image: with 16 the motion is no better, and less is known
-# of how it errs, as small regions are seldom what they seem.
+# Number of planes used, the largest in the image: 16 give no better motion but a less reliable
+# covariance, as small regions are often not planes.
 _PLANES = 8
 _ROUNDS = 4
 # Errors of pose, velocity and the pose before come first in the state, then three of each plane.

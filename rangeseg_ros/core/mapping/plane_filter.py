@@ -34,7 +34,7 @@ from rangeseg_ros.core.tracking.plane_errors import (
 )
 
 _ROUNDS = 5  # until the motion and the weights settle
-# Inverse variance of jumps beforehand, in every direction: of a hundred times the noise of poses.
+# Prior inverse variance of a jump in each direction: 100 standard deviations of the pose noise.
 _PRIOR = 1e-4
 _GATE = chi2_quantile(6)
 
@@ -53,7 +53,7 @@ class PlaneFilters(NamedTuple):
     @classmethod
     def of(cls, seen: Observations) -> PlaneFilters:
         """Planes where they are seen for the first time, of which nothing else is known yet."""
-        # Kilometres, beside which the first observation is all that counts.
+        # 1 km and 1000 rad, so that the first observation decides.
         unknown = np.tile(1e6 * np.eye(3), (len(seen.view), 1, 1))
         return cls(seen.planes, unknown, 0 * seen.view, np.zeros(len(seen.view), np.intp))
 

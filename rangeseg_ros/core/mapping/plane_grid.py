@@ -23,11 +23,11 @@ from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, syste
 from rangeseg_ros.core.significance import OUTLIER
 
 HIT, MISS, SURE, LEAST = 0.85, -0.4, 2.0, -2.0
-"""Log-odds of a look that finds the plane in a cell and of one that does not, from which on a cell
-is sure, and the least, as of OctoMap.
+"""Log-odds of a look that finds the plane in a cell, and of one that does not; least log-odds of
+a cell that is sure; lower bound of log-odds. Values of OctoMap.
 """
 _MOST = 3.5
-# Cells of a grid at most: beyond, they become twice as large, so that memory is bounded.
+# Largest number of cells of a grid: those of larger ones get twice the side, to save memory.
 _CELLS = 2**18
 # Fractional bits of coordinates in OpenCV's polygons.
 _BITS = 8
@@ -95,7 +95,7 @@ class PlaneGrid:
         """Cells (V, U) all of whose corners are in a polygon; of slivers, one in their middle."""
         if not parts:
             return np.zeros(self.odds.shape, np.bool_)
-        self.reach(np.concatenate([ring for part in parts for ring in part]))
+        self.extend_to(np.concatenate([ring for part in parts for ring in part]))
         height, width = self.odds.shape
         lattice = np.zeros((height + 1, width + 1), np.uint8)
         for part in parts:
@@ -126,7 +126,7 @@ class PlaneGrid:
 
     def absorb(self, centres: Floats, odds: Singles) -> None:
         """Take in cells (K, 2) of another grid, with their odds (K,), on this plane."""
-        self.reach(centres)
+        self.extend_to(centres)
         np.maximum.at(self.odds, self.cells(centres), odds)
         self._measure()
 
@@ -150,8 +150,8 @@ class PlaneGrid:
             if parents[k] < 0
         ]
 
-    def reach(self, points: Floats) -> None:
-        """Have cells for points (N, 2), one at least."""
+    def extend_to(self, points: Floats) -> None:
+        """Extend the grid to points (N, 2), one at least."""
         least, most = points.min(axis=0), points.max(axis=0)
         low, high = (np.floor(end / self.side).astype(np.intp) for end in (least, most))
         last = self.first + self.odds.shape[::-1]
@@ -162,7 +162,7 @@ class PlaneGrid:
             return
         if np.prod(last + after - self.first + before) > self._most:
             self._coarsen()
-            return self.reach(points)
+            return self.extend_to(points)
         (height, width), (left, top) = self.odds.shape, before
         odds = np.zeros((height + top + after[1], width + left + after[0]), np.float32)
         odds[top : top + height, left : left + width] = self.odds

@@ -35,7 +35,7 @@ from rangeseg_ros.core.tracking.tracker import NOMINAL
 
 _NOWHERE = Transform.identity(), PoseNoise(0.0, 0.0)
 # Jumps of the poses that are told one by one.
-_TOLD = 10
+_LISTED = 10
 
 
 class Sighting(NamedTuple):
@@ -81,14 +81,14 @@ class PlaneMap:
         self._next = 1
         self._stamp = self._time = self._frames = 0
 
-    def anew(self, why: str) -> PlaneMap:
+    def restarted(self, why: str) -> PlaneMap:
         """An empty map that follows this one: ids are not given twice."""
         other = PlaneMap(self.config)
         other.begun_anew, other.jumps, other._next = why, self.jumps, self._next
         return other
 
     def __len__(self) -> int:
-        return sum(map(self._told, self._records))
+        return sum(map(self._reported, self._records))
 
     def __repr__(self) -> str:
         return f'<PlaneMap of {len(self)} planes>'
@@ -96,8 +96,8 @@ class PlaneMap:
     @property
     def doubts(self) -> list[str]:
         """What the planes say against the poses: jumps, by the stamps of their frames."""
-        found = [f'{stamp * 1e-9:.3f} s: {jump}' for stamp, jump in self.jumps[:_TOLD]]
-        if (more := len(self.jumps) - _TOLD) > 0:
+        found = [f'{stamp * 1e-9:.3f} s: {jump}' for stamp, jump in self.jumps[:_LISTED]]
+        if (more := len(self.jumps) - _LISTED) > 0:
             found.append(f'{more} more frames whose poses the planes contradict')
         return found
 
@@ -109,12 +109,12 @@ class PlaneMap:
         found = [
             describe(record, planes.where([k]), covariance[k])
             for k, record in enumerate(self._records)
-            if self._told(record)
+            if self._reported(record)
         ]
         return sorted(found, key=lambda plane: plane.id)
 
-    def _told(self, record: Record) -> bool:
-        """Whether there is enough of a plane to tell it: no clutter."""
+    def _reported(self, record: Record) -> bool:
+        """Whether the sure part of a plane is large enough for the output, and no clutter."""
         return record.grid.sure_area > self.config.map_area
 
     def add(
@@ -125,7 +125,7 @@ class PlaneMap:
         pose: Transform,
         stamp: int,
     ) -> None:
-        """Take in a frame. Where the fixed frame jumps, planes move along as far as they tell.
+        """Add a frame. If the fixed frame jumps, planes move along as far as they show the jump.
 
         The planes, of these labels (H, W), are in the frame of the image, tracked and with their
         roles; what was measured in the image tells which planes are gone. The pose takes that
@@ -182,7 +182,7 @@ class PlaneMap:
             likely = np.zeros(len(planes))
             np.maximum.at(likely, which, np.exp(-value / 2))
             scores.append(likely @ pixels)
-        # Treads look alike: one that was taken for the next one is no jump by a step.
+        # Treads look alike: a tread matched to its neighbour must not count as a jump of a step.
         if scores[1] <= scores[0]:
             return None
         self.jumps.append((self._stamp, jump))
@@ -224,7 +224,7 @@ class PlaneMap:
             parts.setdefault(k, []).append(plane)
         for k, some in parts.items():
             corners = np.concatenate([part.corners for part in some])
-            grids[k].reach(known.where([k]).coordinates(corners))
+            grids[k].extend_to(known.where([k]).coordinates(corners))
         # Through a lens, or in a cloud, no homography leads from cells to pixels.
         pinhole = camera if camera and not camera.distortion_model else None
         looked_at = in_sight(grids, known, image) if camera else {}

@@ -24,11 +24,11 @@ _PACKAGE = f'{Path(__file__).parents[2].name}.'
 _ahead: Callable[..., None] | None = None
 _inside = ContextVar('inside', default=False)
 
-# With the first kernel, numba looks for SciPy's linear algebra: 14 MB that none here calls. Now it
-# is imported for those that do.
-ensure_blas, linalg.ensure_blas = linalg.ensure_blas, lambda: None
+# At the first kernel, numba would import SciPy's linear algebra: 14 MB that no kernel here calls.
+# Restored afterwards, so that it is imported for kernels that do.
+_ensure_blas, linalg.ensure_blas = linalg.ensure_blas, lambda: None
 import_module('numba.np.arraymath')
-linalg.ensure_blas = ensure_blas
+linalg.ensure_blas = _ensure_blas
 
 
 class NotCompiledError(Exception):

@@ -192,18 +192,18 @@ def _means(values: list[NDArray], kept: list[NDArray]) -> Singles:
     return (total / np.maximum(np.sum(kept, axis=0), 1)).astype(np.float32)
 
 
-# Of bins n times as wide, the budget from which on they are taken (docs/benchmark.md).
+# Least budget at which the sides of bins are n times as long (docs/benchmark.md).
 _SHARES = {1: 1.0, 2: 0.55, 4: 0.35}
 
-STEPS = tuple(_SHARES.values())
-"""Budgets that make a difference, falling."""
+BUDGETS = tuple(_SHARES.values())
+"""The distinct budgets, falling."""
 
 
-def step_within(budget: float) -> int:
+def widening(budget: float) -> int:
     """By how much bins are wider, for a share `budget` of the full work, 0...1."""
     return next((step for step, share in _SHARES.items() if budget >= share), max(_SHARES))
 
 
 def bin_side(shape: tuple[int, int], work_budget: float) -> int:
     """Pixels along the side of the bins of an image (H, W): 2 of VGA, more with less work."""
-    return step_within(work_budget) * max(round(float(np.sqrt(shape[0] * shape[1] / _BINS))), 1)
+    return widening(work_budget) * max(round(float(np.sqrt(shape[0] * shape[1] / _BINS))), 1)

@@ -53,7 +53,7 @@ class Blocks(NamedTuple):
         return blocks
 
     def updated(self, before: RangeImage, image: RangeImage, size: int = BLOCK) -> Blocks:
-        """They, in place: of an image that differs in a few pixels from the one before."""
+        """Update these blocks in place: `image` differs from `before` in a few pixels."""
         _update(before.inverse, image.inverse, image.rays, image.pinhole, size, self)
         return self
 

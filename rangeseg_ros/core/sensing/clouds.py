@@ -175,8 +175,8 @@ def _candidate_frames(
 def _linear_maps(start: Floats, end: Floats) -> tuple[Floats, Floats]:
     """Matrices (3 K, 3, K) that take vectors (N, K) along unit vectors (N, 3), best ones first.
 
-    With the sums (3 K,) of squares of what of the result is across these. The first leads to the
-    side that they point to.
+    Also returns the sums (3 K,) of squares of what is perpendicular to these. The sign of the
+    first map is such that its results point along them.
     """
     across = np.eye(3) - end[:, :, None] * end[:, None, :]
     squares = start[:, :, None] * start[:, None, :]
@@ -215,7 +215,7 @@ def _fitted_line(place: Indices, slope: Floats, size: int) -> tuple[float, float
 
 @lru_cache(maxsize=4)
 def _camera(*lens: Any, **frame: Any) -> Camera | None:
-    """One for all frames, as its rays are worked out once."""
+    """The camera, cached, as its rays are computed once for all frames."""
     try:
         return Camera(*lens, **frame)
     except CameraError:

@@ -41,7 +41,7 @@ class DistortionMap:
         and so is its error.
         """
         self._check(image)
-        along, error = image.along, self.offset
+        along, error = image.depth_over_range, self.offset
         if self.slope is not None:
             with np.errstate(divide='ignore', invalid='ignore'):
                 inverse_depth = image.inverse / along

@@ -16,7 +16,7 @@ from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.significance import quantile
 
 SIGNIFICANT = 5.0
-"""Standard errors that a statistic of an image must differ by, not to be chance in any image."""
+"""Standard errors beyond which a statistic is no chance, in any of all images."""
 # Rows or columns, and those whose spectrum is looked at, that stand for an image.
 _LINES, _FEW = 60, 24
 _LARGEST = 16  # enlargement that is looked for
@@ -84,7 +84,7 @@ def _at_centres(depth: Floats, columns: Indices) -> Floats:
     return np.asarray(sum(sides) / np.maximum(np.sum(known, axis=0), 1))
 
 
-# As long as the camera of the pixels lives: of 12 megapixels, the rays take 150 MB.
+# Weak keys: entries live as long as their cameras, as rays of 12 megapixels take 150 MB.
 _cameras: WeakKeyDictionary[Camera, dict[Cells, Camera]] = WeakKeyDictionary()
 
 

@@ -27,12 +27,12 @@ class Grid(NamedTuple):
 
 
 class View(NamedTuple):
-    """A range image, as it was measured and with holes bridged (`whole`, which `grid` is of).
+    """A range image, or its bins, and what is known of it before planes are looked for.
 
-    Or its bins. With its blocks of 4 x 4 pixels, its errors, the pixels of the smallest plane
-    (`least`), the `area` of a pixel at inverse range 1, m^2, and whether the errors are known: not
-    where they were to be measured and the image says too little. `nodes` are blocks of 2 x 2
-    pixels of `whole`, which growing surfaces takes for itself; None where they are to be made.
+    In `whole` small holes of `image` are bridged; `grid` is of `whole`. `blocks` are 4 x 4 pixels
+    of `image`; `nodes`, 2 x 2 of `whole`, are None or overwritten by `Nodes.of`. `min_pixels` is
+    the size of the smallest plane, and `area` that of a pixel at inverse range 1, m^2.
+    `identified` is False where `sensor` was to be measured and the image shows too little.
     """
 
     image: RangeImage
@@ -40,7 +40,7 @@ class View(NamedTuple):
     blocks: Blocks
     grid: Grid
     sensor: SensorModel
-    least: int
+    min_pixels: int
     area: float
     identified: bool
     nodes: Blocks | None = None

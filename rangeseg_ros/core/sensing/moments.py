@@ -102,8 +102,8 @@ def plane_of(sums: tuple[float, ...]) -> tuple[float, float, float, float]:
     x = scale * (aa * p + bb * q + cc * r)
     y = scale * (bb * p + dd * q + ee * r)
     z = scale * (cc * p + ee * q + ff * r)
-    # Not square - x p - y q - z r: what the plane is off by, as pixels lie in nearly one
-    # direction, counts there at once, here by its square.
+    # Not square - x p - y q - z r: where pixels lie in nearly one direction, theta is inaccurate,
+    # and its error enters there linearly, here squared.
     left = square - 2 * (x * p + y * q + z * r)
     left += x * (a * x + 2 * (b * y + c * z)) + y * (d * y + 2 * e * z) + f * z * z
     return x, y, z, left if left > 0 else 0.0

@@ -242,8 +242,8 @@ class RangeImage:
         return np.array([0.0, -1, 0] if looks[2] > np.abs(looks[:2]).max() else [0.0, 0, 1])
 
     @property
-    def along(self) -> Singles:
-        """(H, W) inverse range over inverse depth, the distance along the optical axis."""
+    def depth_over_range(self) -> Singles:
+        """(H, W) depth over range, which is inverse range over inverse depth; 1 for cameras."""
         if self.camera is not None:
             return np.ones(self.shape, np.float32)
         along: Singles = self.rays @ self.axes[:, 2].astype(np.float32)

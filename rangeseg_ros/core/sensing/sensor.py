@@ -12,7 +12,7 @@ from numba.extending import register_jitable
 from rangeseg_ros.core.arrays import Floats
 from rangeseg_ros.core.config import VGA, Config
 
-# Widths of the kernel that an error is smoothed with, which its correlations along a line sum to.
+# Sum of the correlations exp(-d^2 / (4 w^2)) along a line, in units of the kernel's width w.
 _LINE = 2 * float(np.sqrt(np.pi))
 
 
@@ -53,8 +53,8 @@ class SensorModel(NamedTuple):
             config.pixel_noise,
         )
 
-    def every(self, step: float) -> SensorModel:
-        """The model of images of every `step`-th row and column."""
+    def rescaled(self, step: float) -> SensorModel:
+        """The model of images with one pixel for each `step` pixels along rows and columns."""
         return self._replace(
             correlation=self.correlation / step,
             distortion_length=self.distortion_length / step,
@@ -69,7 +69,7 @@ class SensorModel(NamedTuple):
             alike = np.exp(-((line[:, None] - line) ** 2) / (4 * self.correlation**2))
         white = self.white / side**2
         left = white + (1 - self.white) * max(float(alike.mean()) ** 2, 1 / side**2)
-        return self.every(side)._with_variance(left)._replace(white=white / left)
+        return self.rescaled(side)._with_variance(left)._replace(white=white / left)
 
     def of_pixels(self, side: int, excess: float) -> SensorModel:
         """The model of pixels, of the means of whose squares this one is.
@@ -77,7 +77,7 @@ class SensorModel(NamedTuple):
         Their random variance is `excess` times that of the means, and what it is more is new in
         every pixel.
         """
-        pixels = self.every(1 / side)._with_variance(excess)
+        pixels = self.rescaled(1 / side)._with_variance(excess)
         return pixels._replace(white=1 - (1 - self.white) / excess)
 
     def _with_variance(self, share: float) -> SensorModel:
@@ -110,7 +110,7 @@ class SensorModel(NamedTuple):
         return ', '.join(said)
 
     @property
-    def patch(self) -> float:
+    def pixel_inflation(self) -> float:
         """Variance of the mean of 2 x 2 pixels over that of white noise, 1 to 4.
 
         So many pixels count as one measurement of the labelling, which compares neighbours.
@@ -121,7 +121,7 @@ class SensorModel(NamedTuple):
         return float(1 + 2 * alike[0] + alike[1])
 
     @property
-    def correlated(self) -> float:
+    def region_inflation(self) -> float:
         """Pixels of a large region that count as one measurement: the sum of the correlations."""
         return self.white + (1 - self.white) * max(4 * np.pi * self.correlation**2, 1.0)
 
@@ -131,7 +131,7 @@ class SensorModel(NamedTuple):
         return self.distortion_length**2
 
     @property
-    def agreement(self) -> float:
+    def block_inflation(self) -> float:
         """By how much the noise of neighbouring blocks of 4 pixels exceeds that of white noise."""
         if self.correlation == 0:
             return 1.0
@@ -163,8 +163,8 @@ def correlated_residuals(width: float) -> tuple[float, float, float, float]:
     return four / 13, eight / 61, sixteen / 253, (eight - 4 * four) / 9
 
 
-# Of the variance of a distortion, what a plane through as many pixels as it is wide leaves, about
-# as maximum likelihood over planes of 12 sensors has it.
+# Share of a distortion's variance that a plane fitted to a square of its width leaves: the
+# maximum-likelihood estimate from planes of 12 sensors.
 _SHARE = 0.15
 
 
@@ -179,8 +179,7 @@ def distortion_share(pixels: float, smooth: float) -> float:
     return float(_SHARE * ratio * np.sqrt(ratio))
 
 
-# No sensor is without error: an exact (simulated) image has that of its float32 numbers.
-FLOOR = 1e-12
+FLOOR = 1e-12  # (1/m)^2, rounding of float32: the least variance, of exact (simulated) images
 
 
 @register_jitable(inline='always')

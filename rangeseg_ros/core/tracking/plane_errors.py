@@ -14,15 +14,15 @@ from rangeseg_ros.core.significance import chi2_quantile
 
 # Chi-squared, with the three degrees of freedom of a plane, up to which two planes may be one.
 GATE = chi2_quantile(3)
-# What planes of one surface differ by from frame to frame beyond their covariances, as their
-# pixels are not the same: an offset, as share of the range (of 2 m, half of what the distortion of
-# a Kinect is there), and an angle, at least and for an offset over half of the plane's width.
+# Differences of planes of one surface between frames, beyond their covariances, as their pixels
+# differ. OFFSET: share of the range (at 2 m half of a Kinect's distortion). ANGLE: the least one;
+# the offset over half of the plane's width is added to it.
 OFFSET, ANGLE = 0.007, np.radians(1.0)
 # Half the width that a plane counts with at least, metres, so that what it tilts by is finite.
 NARROWEST = 0.01
-# Largest angle, and offset as share of the range, of what may be one plane from frame to frame.
-# Beyond is no error of the sensor but another plane, however uncertain both are.
-SURE_TURN, FARTHEST = np.radians(15.0), 0.1
+# Largest angle, and offset as share of the range, between one plane and itself in the next frame.
+# Larger ones are no errors of the sensor, however uncertain both planes are.
+LARGEST_TURN, LARGEST_OFFSET = np.radians(15.0), 0.1
 
 
 def candidates(first: tuple[Floats, Floats], second: tuple[Floats, Floats], reach: Floats) -> Mask:
@@ -31,8 +31,8 @@ def candidates(first: tuple[Floats, Floats], second: tuple[Floats, Floats], reac
     Of the first, normals (N, 3) and distances (N,); of the second, normals and points (M, 3) on
     the planes, which are so far (M,) from the camera, metres.
     """
-    near: Mask = first[0] @ second[0].T > np.cos(SURE_TURN)
-    return near & (np.abs(first[0] @ second[1].T + first[1][:, None]) < FARTHEST * reach)
+    near: Mask = first[0] @ second[0].T > np.cos(LARGEST_TURN)
+    return near & (np.abs(first[0] @ second[1].T + first[1][:, None]) < LARGEST_OFFSET * reach)
 
 
 def with_floor(spread: Floats, reach: Floats, width: Floats | float = np.inf) -> Floats:

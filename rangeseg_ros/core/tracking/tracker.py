@@ -31,11 +31,11 @@ from rangeseg_ros.core.tracking.plane_errors import (
     with_floor,
 )
 
-# Intersection over union that planes in reach of each other count with, beside what they have: a
-# plane that has just come out of hiding overlaps with nothing, and one in sight overlaps more.
+# Overlap that is added to the intersection over union of all planes within reach, so that a plane
+# that has just come out of hiding can be matched, and one that overlaps is preferred.
 _UNSEEN_OVERLAP = 0.1
-# Seconds between frames that stamps which do not tell (the same, or none) stand for; and what that
-# speed is kept up for, as hands and heads change their minds about that often.
+# Seconds between frames whose stamps are equal or missing, and the time for which hands and heads
+# keep their velocity.
 NOMINAL, PERSISTENCE = 1 / 30, 0.5
 # The equations of the motion are nearly linear in it: rounds at most, and the squared step, in
 # variances of the motion, that changes nothing any more.

@@ -2,7 +2,7 @@
 
 The sensor measures 24 x 24 points [1]_; the device fuses them with its colour image into a depth
 map of 256 x 192 pixels without holes [2]_. Real frames show what that leaves: noise of a few
-tenths of a millimetre, which is little more than the rounding, smooth waves of about 5 mm that
+tenths of a millimetre, which is little more than the rounding, smooth waves of 5 to 8 mm that
 are alike over some twenty pixels, and silhouettes blurred over a few pixels.
 
 References
