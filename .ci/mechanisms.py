@@ -90,7 +90,7 @@ def _near_height_zero(_: Any) -> Any:
 
 
 _DISTORTION = 'fitting/noise.py:_over_scales,_ratio'
-_CORRELATION = 'fitting/noise.py:_random'
+_CORRELATION = 'fitting/noise.py:_split'
 _NOISE = ('noise', 'error_law')
 _NORMALS = ('method', 'labelling', 'normals', 'directions')
 # Cost of a border that lets nothing merge by the energy.

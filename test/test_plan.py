@@ -23,7 +23,7 @@ from rangeseg_ros.core.ground.stairs import Stairs
 from rangeseg_ros.core.mapping.plane_grid import PlaneGrid
 from rangeseg_ros.io.plans import write_dxf, write_geojson
 from rangeseg_ros.plan.flights import Flight, flights
-from rangeseg_ros.plan.floor_plan import FREE, FloorPlan, Up, Wall, _openings, estimate_up
+from rangeseg_ros.plan.floor_plan import FREE, FloorPlan, PlanUp, Wall, _openings, estimate_up
 from rangeseg_ros.plan.right_angles import square_up
 from rangeseg_ros.report.plan import svg
 from rangeseg_ros.simulation.scenes import OPTICAL_IN_BODY
@@ -286,7 +286,7 @@ def test_stairs_of_several_frames_are_one_flight():
 
 def test_stairs_are_in_every_drawing(tmp_path):
     edges = np.array([[[1.0, 0, 0], [1, 1, 0]], [[1.28, 0, 0], [1.28, 1, 0]]])[..., :2]
-    up, cells = Up(np.array([0.0, 0, 1]), 0.0, 'test'), np.zeros((20, 20), np.int8)
+    up, cells = PlanUp(np.array([0.0, 0, 1]), 0.0, 'test'), np.zeros((20, 20), np.int8)
     flight, still = Flight(edges, 0.17, 0.28, 'up'), Transform.identity()
     plan = FloorPlan('map', still, up, 0.0, [], [], [], [flight], cells, (0.0, 0.0), 0.1)
     write_dxf(tmp_path / 'a.dxf', plan)

@@ -8,7 +8,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.fitting.error_law import Law, Strata, fit_law
-from rangeseg_ros.core.fitting.noise import ROUGH, _random, measured_sensor, nested, quantisation
+from rangeseg_ros.core.fitting.noise import ROUGH, _split, measured_sensor, nested, quantisation
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.moments import COUNT, SIZE
@@ -257,7 +257,7 @@ def test_white_and_correlated_noise_are_told_from_blocks_of_several_sizes(white,
     small, larger, largest, apart = correlated_residuals(width)
     apart = filled * apart + (1 - filled) * small
     shown = [3 * (white + (1 - white) * v) for v in (small, larger, largest, apart)]
-    total, share, length = _random(shown[:3], shown[3], filled)
+    total, share, length = _split(shown[:3], shown[3], filled)
     assert (total, share) == pytest.approx((3, white), abs=1e-6)
     assert white == 1 or length == width
 

@@ -25,7 +25,7 @@ from rangeseg_ros.io.files import NotReplacedError
 from rangeseg_ros.io.plans import plan_files, write_plan
 from rangeseg_ros.io.recordings import BagError
 from rangeseg_ros.io.transforms import fixed_frame_of
-from rangeseg_ros.plan.floor_plan import Up, estimate_up, make_plan, points_within
+from rangeseg_ros.plan.floor_plan import PlanUp, estimate_up, make_plan, points_within
 from rangeseg_ros.report.plan import write_picture, write_plan_page
 
 PICTURE, PAGE = 'plan.svg', 'plan.html'
@@ -48,12 +48,12 @@ class PlanOutcome:
 
 
 @dataclass
-class _Stretch:
-    """What was seen while the map was one: it begins anew where the fixed frame jumps.
+class _MapSession:
+    """Frames that share one map; a new one begins where the fixed frame jumps.
 
     `frames` are the numbers of its frames, `heights` of the sensor in them, metres, NaN where not
-    known; `stairs` that they show, with their places among the frames; `looked` and `told` sums
-    of the directions of up in the images, by the parameters and by `gravity_frame`.
+    known; `stairs` that they show, with their places among the frames; `parameter_up` and
+    `gravity_up` sums of the directions of up in the images, by the parameters and that frame.
     """
 
     map: PlaneMap
@@ -61,8 +61,8 @@ class _Stretch:
     frames: list[int] = field(default_factory=list)
     heights: list[float] = field(default_factory=list)
     stairs: list[tuple[Stairs, int]] = field(default_factory=list)
-    looked: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    told: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    parameter_up: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    gravity_up: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def extent(self) -> tuple[float, int]:
@@ -120,9 +120,10 @@ class PlanTask:
         if solution.drifts:
             warnings.append(solution.drift_text())
         points = self._points(best.frames, solution, config)
-        up = estimate_up(solution.planes, best.looked, np.radians(config.role_tolerance))
-        if best.told.any():
-            up = Up(best.told / np.linalg.norm(best.told), 0.0, config.gravity_frame)
+        up = estimate_up(solution.planes, best.parameter_up, np.radians(config.role_tolerance))
+        if best.gravity_up.any():
+            direction = best.gravity_up / np.linalg.norm(best.gravity_up)
+            up = PlanUp(direction, 0.0, config.gravity_frame)
         grid = self.headroom, self.resolution
         stairs = [(each, solution.poses[k]) for each, k in best.stairs]
         heights = np.array(best.heights)[:, None] * up.direction
@@ -138,13 +139,15 @@ class PlanTask:
         told = config.map_frame, up.source, content, warnings
         return PlanOutcome(frames, len(best.frames), *told)
 
-    def _map(self, config: Config, progress: Progress | None) -> tuple[int, _Stretch, list[str]]:
-        """Number of frames, the stretch with the largest map, and what is to be told."""
+    def _map(
+        self, config: Config, progress: Progress | None
+    ) -> tuple[int, _MapSession, list[str]]:
+        """Number of frames, the session with the largest map, and warnings."""
         sequence = SequenceSegmenter(config)
         noise = PoseNoise(config.pose_noise, np.radians(config.pose_turn_noise))
 
-        def begin() -> _Stretch:
-            return _Stretch(sequence.map, Adjustment(noise, odometry=not config.fixed_frame))
+        def begin() -> _MapSession:
+            return _MapSession(sequence.map, Adjustment(noise, odometry=not config.fixed_frame))
 
         stretches, frames, warnings = [begin()], 0, []
         with self._open() as source, Locator(self.recording, config) as located:
@@ -162,9 +165,9 @@ class PlanTask:
                     now.heights.append(getattr(found.survey, 'sensor_height', 0) or np.nan)
                     now.seen.add(sequence.map.sighting)
                     turn = sequence.pose.rotation
-                    now.looked += turn @ (config.up_x, config.up_y, config.up_z)
+                    now.parameter_up += turn @ (config.up_x, config.up_y, config.up_z)
                     if located.last.up is not None:
-                        now.told += turn @ located.last.up
+                        now.gravity_up += turn @ located.last.up
             warnings += [f'{n} frames without the {why}' for why, n in located.problems.items()]
             if source.damage:
                 warnings.append(source.damage)

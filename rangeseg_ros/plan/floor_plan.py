@@ -14,7 +14,7 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.stairs import Stairs
 from rangeseg_ros.core.mapping.adjustment import Solution
 from rangeseg_ros.core.mapping.map_planes import MapPlane, moved_planes
-from rangeseg_ros.core.mapping.plane_grid import HIT, LEAST, MISS, PlaneGrid
+from rangeseg_ros.core.mapping.plane_grid import HIT, MISS, SURE, PlaneGrid
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.rotations import turn_between
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -65,7 +65,7 @@ def occupancy(
     return grid
 
 
-class Up(NamedTuple):
+class PlanUp(NamedTuple):
     """The direction that is up in the fixed frame, and what tells it.
 
     Its standard deviation, radians, is 0 where it was told.
@@ -106,7 +106,7 @@ class FloorPlan(NamedTuple):
 
     frame: str
     motion: Transform
-    up: Up
+    up: PlanUp
     ground: float
     planes: list[Squared]
     walls: list[Wall]
@@ -123,7 +123,7 @@ def deviation_of(plane: MapPlane) -> float:
     return float(np.sqrt(max(lever @ plane.covariance @ lever, 0)))
 
 
-def estimate_up(planes: Sequence[MapPlane], looked: Floats, tolerance: float) -> Up:
+def estimate_up(planes: Sequence[MapPlane], looked: Floats, tolerance: float) -> PlanUp:
     """Which way is up by what is level and what is upright.
 
     Of the directions of planes near to what was up in the images, that with the largest area of
@@ -141,7 +141,7 @@ def estimate_up(planes: Sequence[MapPlane], looked: Floats, tolerance: float) ->
     # A camera is turned less than half a right angle away from level in the mean.
     tried = tried[tried @ looked > np.sqrt(0.5)]
     if not len(tried):
-        return Up(looked, np.pi / 4, 'the images')
+        return PlanUp(looked, np.pi / 4, 'the images')
     cosine = np.abs(tried @ normals.T)
     fits = (cosine > np.cos(tolerance)) | (cosine < np.sin(tolerance))
     up = guess = tried[int((fits @ area * (tried @ looked)).argmax())]
@@ -155,14 +155,14 @@ def estimate_up(planes: Sequence[MapPlane], looked: Floats, tolerance: float) ->
         up = vectors[:, 0] * np.sign(vectors[:, 0] @ up)
     # One set of parallel walls leaves up free along them, and no level or upright plane anywhere.
     if values[1] < 1e-6 * values[2] or values[1] <= 0:
-        return Up(guess, np.pi / 4, 'planes that do not tell it')
-    return Up(up, float(1 / np.sqrt(values[1])), 'level and upright planes')
+        return PlanUp(guess, np.pi / 4, 'planes that do not tell it')
+    return PlanUp(up, float(1 / np.sqrt(values[1])), 'level and upright planes')
 
 
 def make_plan(
     solution: Solution,
     frame: str,
-    up: Up,
+    up: PlanUp,
     points: Iterable[Floats],
     stairs: Sequence[tuple[Stairs, Transform]],
     stood: Floats,
@@ -203,7 +203,7 @@ def make_plan(
     return FloorPlan(*told, cells, (x, y), resolution)
 
 
-def _upright(up: Up) -> Transform:
+def _upright(up: PlanUp) -> Transform:
     """The least turn that takes up to z; none where z is up within the errors."""
     cosine = float(np.clip(up.direction[2], -1, 1))
     if np.arccos(cosine) ** 2 <= chi2_quantile(2) * up.deviation**2:
@@ -286,7 +286,7 @@ def _drawn(grid: PlaneGrid, floors: Sequence[MapPlane], walls: Sequence[Wall]) -
         grid.extend_to(np.zeros((1, 2)))
     cells = np.where(grid.odds < 0, FREE, UNKNOWN).astype(np.int8)
     cells[grid.fill(free)] = FREE
-    cells[grid.odds > -LEAST] = OCCUPIED
+    cells[grid.odds >= SURE] = OCCUPIED
     for start, end in lines:
         count = max(int(np.linalg.norm(end - start) / grid.side * 2), 1) + 1
         cells[grid.cells(np.linspace(start, end, count))] = OCCUPIED

@@ -64,25 +64,27 @@ def _probabilities(
     total: Floats,
     theta: Floats,
     sensor: SensorModel,
-    alike: float,
+    region_inflation: float,
     prior: float,
 ) -> Floats:
     """Probabilities of regions; `total` and `theta` are of these and then of the pairs."""
     count = len(theta) - len(pairs)
     alone, shared = np.zeros(count), np.zeros(count)
     for k in range(1, count):
-        alone[k] = _probability(sums, k, k, total[k], theta[k], sensor, alike, prior)
+        alone[k] = _probability(sums, k, k, total[k], theta[k], sensor, region_inflation, prior)
     result = alone.copy()
     for e in range(len(pairs)):
         a, b = pairs[e, 0], pairs[e, 1]
         if not (theta[a].any() and theta[b].any()):
             continue
-        one, other = _evidence(sums, a, b, theta, sensor, alike)
+        one, other = _evidence(sums, a, b, theta, sensor, region_inflation)
         for k, own, further in ((a, one, other), (b, other, one)):
             # The alternatives: both are planes; or this one is, and only the other is curved.
             share, p = 1 / (1 + np.exp(-own) + np.exp(-own - further)), count + e
             if share > shared[k]:
-                both = _probability(sums, a, b, total[p], theta[p], sensor, alike, prior)
+                both = _probability(
+                    sums, a, b, total[p], theta[p], sensor, region_inflation, prior
+                )
                 shared[k], result[k] = share, alone[k] + share * (both - alone[k])
     return result
 
@@ -96,7 +98,7 @@ def _probability(
     total: Floats,
     theta: Floats,
     sensor: SensorModel,
-    alike: float,
+    region_inflation: float,
     prior: float,
 ) -> float:
     """Posterior probability of a region, or of two as one, to be a plane."""
@@ -104,7 +106,7 @@ def _probability(
         return prior
     size, square, linear, bend, scale, ratio = _residuals(sums, a, b, theta, sensor)
     # Noise as the region itself shows it: at a grazing angle it is more than the sensor's.
-    noise = alike * max((square - linear - bend) / size, 1.0)
+    noise = region_inflation * max((square - linear - bend) / size, 1.0)
     distortion = ratio * distortion_share(size, max(sensor.distortion_length**2, 1.0)) * size / 3
     # Sum of squares, for each of the three terms, of a bend as large as the region is wide.
     width = _area(total) * size / (3 * scale**2)
@@ -149,7 +151,7 @@ def _residuals(
 
 @njit(cache=True, error_model='numpy')
 def _evidence(
-    sums: RegionSums, a: int, b: int, theta: Floats, sensor: SensorModel, alike: float
+    sums: RegionSums, a: int, b: int, theta: Floats, sensor: SensorModel, region_inflation: float
 ) -> tuple[float, float]:
     """Log-likelihood ratios that regions a and b follow one quadratic, against planes of each.
 
@@ -176,7 +178,7 @@ def _evidence(
                 crease -= quadratic[c] * terms[c]
             cells, left = cells + 1, left + count * own**2
             square, along = square + count * crease**2, along - count * crease * own
-        odds[part] = (2 * along - square) / (2 * max(alike, left / max(cells - 3, 1)))
+        odds[part] = (2 * along - square) / (2 * max(region_inflation, left / max(cells - 3, 1)))
     return odds[0], odds[1]
 
 

@@ -86,7 +86,7 @@ def measured_sensor(
     least = Law(rounding**2, range_rounding**2)
     used = _thinned(used, _MOST)
     freedom = np.maximum(count - 3, 1)
-    mean_square = coarse.residual / (freedom * _share(_median(freedom, used)))
+    mean_square = coarse.residual / (freedom * _quantile_over_mean(_median(freedom, used)))
 
     strata = Strata.of(coarse, used)
     shown = quantile(mean_square.ravel()[strata.blocks], _QUANTILE)
@@ -96,7 +96,7 @@ def measured_sensor(
     if found is None:
         return prior
     within, between, filled, distortion, unbent = found
-    total, white, width = _random(within, between, filled)
+    total, white, width = _split(within, between, filled)
     # Blocks hide a part of the noise, and never show more than there is.
     return prior._replace(
         noise=max(float(np.sqrt(noise.constant * total)), rounding),
@@ -189,16 +189,16 @@ def _ratio(blocks: Blocks, level: Floats, used: Indices, strata: Strata) -> floa
     freedom = np.maximum(blocks.moments[..., COUNT] - 3, 1)
     ratio = blocks.residual / (level * freedom)
     shown = quantile(ratio.ravel()[strata.blocks], _QUANTILE).mean()
-    return float(shown) / _share(_median(freedom, used))
+    return float(shown) / _quantile_over_mean(_median(freedom, used))
 
 
 @cache
-def _share(freedom: float) -> float:
+def _quantile_over_mean(freedom: float) -> float:
     """Quantile of chi-squared of so many degrees of freedom over its mean."""
     return chi2_quantile(freedom, _QUANTILE) / freedom
 
 
-def _random(within: list[float], between: float, filled: float) -> tuple[float, float, float]:
+def _split(within: list[float], between: float, filled: float) -> tuple[float, float, float]:
     """Total variance, white share and correlation length that explain V(4), V(8), V(16), M(8).
 
     By least squares relative to these, for each of some widths. Of a block only a share is

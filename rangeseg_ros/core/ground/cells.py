@@ -1,7 +1,7 @@
-"""Cells of a few pixels: what the ground is looked for in, and continued in.
+"""GroundCells of a few pixels: what the ground is looked for in, and continued in.
 
 A cell is the mean of its pixels, which for a plane is a point of the plane: theta . ray = inverse
-is linear. Cells are wider than high, because the ground recedes along the columns.
+is linear. GroundCells are wider than high, because the ground recedes along the columns.
 
 The ground continued is a plane for every cell. Each block's plane is fitted to the ground in a
 window around it, with that of the whole image as its prior, whose own is the plane under the robot
@@ -31,7 +31,7 @@ or not known, ground, in the way, below.
 """
 # Rows of an image whose cells are 1 x 2 pixels.
 _ROWS = 120
-# Cells of a block of the ground continued, which is about square.
+# GroundCells of a block of the ground continued, which is about square.
 _DOWN, _RIGHT = 4, 2
 # The prior counts as so much of a window full of ground: it decides where little of it is seen.
 _PRIOR = 1 / 16
@@ -55,7 +55,7 @@ class CellSize(NamedTuple):
         return wide[: shape[0], : shape[1]]
 
 
-class Cells(NamedTuple):
+class GroundCells(NamedTuple):
     """Means of the pixels of cells, (rows, columns), with the nearest row first.
 
     `ray` (3, ...) and `inverse` (...) range, 1/m, of the measured pixels, 0 where less than half
@@ -85,7 +85,7 @@ def axes_of(up: Floats) -> Floats:
     return np.array([up, ahead, np.cross(up, ahead)])
 
 
-def cells_of(image: RangeImage, up: Floats, sensor: SensorModel, turned: bool) -> Cells:
+def cells_of(image: RangeImage, up: Floats, sensor: SensorModel, turned: bool) -> GroundCells:
     """Cells of an image; `up` (3,) is a unit vector in its frame, `turned` where it is down."""
     size, axes = CellSize.for_image(image.shape), axes_of(up)
     shape = -(-image.shape[0] // size.rows), -(-image.shape[1] // size.columns)
@@ -105,7 +105,7 @@ def cells_of(image: RangeImage, up: Floats, sensor: SensorModel, turned: bool) -
     share = sensor.white / (size.rows * size.columns) + 1 - sensor.white
     # No height is known better than it is computed, far away least of all.
     of_mean = np.where(whole, error.astype(np.float64) ** 2 * share + 1e-8 + rounding**2, 0.0)
-    return Cells(ray, inverse, place, error.astype(np.float32), of_mean, size, axes, order)
+    return GroundCells(ray, inverse, place, error.astype(np.float32), of_mean, size, axes, order)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -164,7 +164,7 @@ class GroundField(NamedTuple):
         """Of the image with rows and columns exchanged."""
         return GroundField(self.theta.transpose(0, 2, 1), CellSize(*self.size[::-1]), self.up)
 
-    def heights(self, cells: Cells) -> Singles:
+    def heights(self, cells: GroundCells) -> Singles:
         """Heights (rows, columns) of cells above the ground, metres; NaN where not measured."""
         along = (self.theta * cells.ray).sum(axis=0)
         with np.errstate(divide='ignore', invalid='ignore'):
@@ -174,7 +174,7 @@ class GroundField(NamedTuple):
         return heights
 
 
-def ground_field(cells: Cells, ground: Mask, base: Floats) -> GroundField:
+def ground_field(cells: GroundCells, ground: Mask, base: Floats) -> GroundField:
     """The ground continued, from its cells (rows, columns) and the plane (3,) under the robot."""
     sums = _sums(cells.ray, cells.inverse, ground)
     whole = _fitted(sums.sum(axis=(1, 2), keepdims=True), base)

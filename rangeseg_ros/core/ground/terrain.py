@@ -19,7 +19,7 @@ from rangeseg_ros.core.ground.cells import (
     GROUND,
     OBSTACLE,
     UNKNOWN,
-    Cells,
+    GroundCells,
     GroundField,
     cells_of,
     classify,
@@ -32,7 +32,7 @@ from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # Standard deviations of noise: the ground errs by no more, and what errs by more is none.
 _CERTAIN = 3.0
-# Cells among which noise keeps some out of a chain, and over which relief is measured.
+# GroundCells among which noise keeps some out of a chain, and over which relief is measured.
 _AROUND = np.ones((5, 5), np.uint8)
 SURE = 0.99
 """Least confidence with which ground counts as ground; with less, it is unknown."""
@@ -43,7 +43,7 @@ FURNITURE = 1.5
 class CellTerrain(NamedTuple):
     """What the cells of an image are, (rows, columns), with the nearest row first.
 
-    `place` (3, ...) and `error` (...) are those of `Cells`, `height` (...) is above the ground,
+    `place` (3, ...) and `error` (...) are those of `GroundCells`, `height` (...) above the ground,
     metres, NaN where not measured, `kind` (...) `GROUND` or another class, and `crossing` (2, ...)
     where the ray crosses the ground continued, on the axes of `place`; NaN where it does not.
     """
@@ -167,7 +167,7 @@ def _contradiction(height: float, seen: Continuation | None) -> str:
 
 
 def _with_ground(
-    image: RangeImage, cells: Cells, reached: Mask, stand: Stand, config: Config
+    image: RangeImage, cells: GroundCells, reached: Mask, stand: Stand, config: Config
 ) -> Terrain:
     """Classes and heights by the ground that was reached, continued."""
     field = ground_field(cells, reached, stand.theta)
@@ -204,7 +204,7 @@ def _with_ground(
 
 def _without_ground(
     image: RangeImage,
-    cells: Cells,
+    cells: GroundCells,
     seen: Continuation | None,
     stand: Stand,
     known: tuple[float, float],
@@ -226,8 +226,8 @@ def _without_ground(
     return Terrain(classes, np.full(image.shape, np.nan, np.float32), stand, nowhere)
 
 
-def _faces(cells: Cells, config: Config) -> Mask:
-    """Cells (rows, columns) of surfaces that rise more steeply than any ground."""
+def _faces(cells: GroundCells, config: Config) -> Mask:
+    """GroundCells (rows, columns) of surfaces that rise more steeply than any ground."""
     steep = np.zeros(cells.inverse.shape, np.bool_)
     if len(steep) < 3:
         return steep

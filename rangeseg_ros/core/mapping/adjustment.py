@@ -71,14 +71,11 @@ class Solution(NamedTuple):
     drifts: bool
     field: Floats
 
-    def corrected(self, image: RangeImage, stated: float) -> RangeImage:
-        """An image of a camera, of the same cells, without the field; any other one as it is.
-
-        `stated` is the parameter `distortion_length`.
-        """
-        if image.camera is None or len(cell_rays(image, stated)) != len(self.field):
+    def corrected(self, image: RangeImage, distortion_length: float) -> RangeImage:
+        """An image of a camera, of the same cells, without the field; any other one as it is."""
+        if image.camera is None or len(cell_rays(image, distortion_length)) != len(self.field):
             return image
-        error = field_in_pixels(self.field, image.shape, stated)
+        error = field_in_pixels(self.field, image.shape, distortion_length)
         return DistortionMap(error.astype(np.float32)).corrected(image)
 
     def drift_text(self) -> str:
@@ -161,7 +158,7 @@ class Adjustment:
         size = max(float(np.median(sizes)), 1.0) if len(sizes) else 1.0
         precision = np.repeat([1.0, size], [own.shape[1], field.shape[1]]) / LASTING
         told = _State(PlaneSet.of(planes), *map(np.array, zip(*self._poses, strict=True)))
-        sightings = _Sightings(frame[used], plane[used], seen, root, lasting, precision)
+        sightings = _Measurements(frame[used], plane[used], seen, root, lasting, precision)
         state, rest, covariance = self._solved(told, sightings, drifts=not self._odometry)
         drift = rest[-3:]
         drift_covariance = covariance[-3:, -3:]
@@ -182,7 +179,7 @@ class Adjustment:
         )
 
     def _solved(
-        self, told: _State, sightings: _Sightings, drifts: bool
+        self, told: _State, sightings: _Measurements, drifts: bool
     ) -> tuple[_State, Floats, Floats]:
         """The most probable state and all else, and the covariance of all planes and the drift."""
         # What lasts, what jumps were taken for wrongly, and the drift.
@@ -252,7 +249,7 @@ def _blocks(values: Floats, column: Indices, count: int) -> sparse.csr_array:
     return sparse.csr_array((values.ravel(), columns, begin), (3 * len(values), size * count))
 
 
-class _Sightings(NamedTuple):
+class _Measurements(NamedTuple):
     """N planes as cameras saw them, with the roots (N, 3, 3) of the covariances of their errors.
 
     Of each the numbers of its frame and plane. `lasting` (3 N, L) is what lasts of each run and of
@@ -287,7 +284,7 @@ class _State(NamedTuple):
             self.planes.without(planes.reshape(-1, 3)), back @ self.turn, self.shift - shift
         )
 
-    def equations(self, sightings: _Sightings, rest: Floats) -> tuple[sparse.csr_array, Floats]:
+    def equations(self, sightings: _Measurements, rest: Floats) -> tuple[sparse.csr_array, Floats]:
         """Derivatives (3 N, D) of observations by all unknowns, and the gaps (3 N,), whitened.
 
         Of the `rest`, the first are what lasts of the errors; the others are of the poses only.

@@ -184,13 +184,13 @@ def continuity(before: Floats, now: Floats) -> Floats:
     return np.where(alike >= 0.5, 1.0, alike)
 
 
-def views(labels: Labels, planes: Sequence[Plane], stated: float) -> Floats:
+def views(labels: Labels, planes: Sequence[Plane], distortion_length: float) -> Floats:
     """Where in the image planes are: pixels in each of its square cells, as unit vectors (M, C).
 
-    Cells are twice as large as the pixels over which the errors of the sensor hang together, as
-    the parameter `distortion_length` has `stated`.
+    Cells are twice as large as the pixels over which the errors of the sensor hang together, by
+    the parameter `distortion_length`.
     """
-    step, cell = _cells(labels.shape, stated)
+    step, cell = _cells(labels.shape, distortion_length)
     coarse, count = labels[::step, ::step], int(cell[-1, -1]) + 1
     listed = np.array([plane.label for plane in planes], np.intp)
     number = np.zeros(max(int(listed.max(initial=0)), int(coarse.max(initial=0))) + 1, np.intp)
@@ -202,25 +202,25 @@ def views(labels: Labels, planes: Sequence[Plane], stated: float) -> Floats:
     return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1))
 
 
-def _cells(shape: tuple[int, int], stated: float) -> tuple[int, Indices]:
+def _cells(shape: tuple[int, int], distortion_length: float) -> tuple[int, Indices]:
     """Step of the pixels that are looked at, and their cells (H / step, W / step)."""
-    length = length_of_distortion(stated, shape)
+    length = length_of_distortion(distortion_length, shape)
     step = max(int(2 * length // _SAMPLES), 1)
     side = max(int(2 * length / step), 1)
     rows, columns = (np.arange(-(-size // step)) // side for size in shape)
     return step, rows[:, None] * (columns[-1] + 1) + columns
 
 
-def cell_rays(image: RangeImage, stated: float) -> Floats:
+def cell_rays(image: RangeImage, distortion_length: float) -> Floats:
     """(C, 3) mean rays of the cells of `views`."""
-    step, cell = _cells(image.shape, stated)
+    step, cell = _cells(image.shape, distortion_length)
     rays = image.rays[::step, ::step].reshape(-1, 3)
     sums = [np.bincount(cell.ravel(), part) for part in rays.T]
     return np.stack(sums, axis=1) / np.bincount(cell.ravel())[:, None]
 
 
-def field_in_pixels(field: Floats, shape: tuple[int, int], stated: float) -> NDArray:
-    """A field over cells (C,) in the pixels of an image (H, W); `stated` as for `views`."""
-    step, cell = _cells(shape, stated)
+def field_in_pixels(field: Floats, shape: tuple[int, int], distortion_length: float) -> NDArray:
+    """A field over the cells (C,) of `views` in the pixels of an image (H, W)."""
+    step, cell = _cells(shape, distortion_length)
     side = step * int(np.count_nonzero(cell[0] == 0))
     return in_pixels(field.reshape(-1, int(cell[0, -1]) + 1), side, shape)
