@@ -14,10 +14,11 @@ from scipy.spatial.transform import Rotation
 from rangeseg_ros import Config, RangeImage, Transform
 from rangeseg_ros.core.mapping.observations import PoseNoise, observations
 from rangeseg_ros.core.mapping.plane_filter import PlaneFilters
-from rangeseg_ros.core.mapping.plane_grid import HIT, MISS, PlaneGrid
+from rangeseg_ros.core.mapping.plane_grid import PlaneGrid
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import SequenceSegmenter, with_roles
+from rangeseg_ros.core.significance import HIT, MISS
 from rangeseg_ros.plan.floor_plan import deviation_of
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import Pose, Scene, kinect_room, walk

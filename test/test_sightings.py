@@ -9,14 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import Camera, RangeImage, Transform
 from rangeseg_ros.core.mapping.observations import PlaneSet
-from rangeseg_ros.core.mapping.plane_grid import (
-    HIT,
-    PlaneGrid,
-    in_sight,
-    passed_through,
-    seen_cells,
-)
+from rangeseg_ros.core.mapping.plane_grid import PlaneGrid, in_sight, passed_through, seen_cells
 from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.significance import HIT
 from rangeseg_ros.core.tracking.plane_errors import tangents
 
 CAMERA = Camera(40, 30, 35.0, 38.0, 17.0, 16.0)

@@ -15,6 +15,10 @@ CLEARLY = 2.0  # how many times more must speak for one of two things than for t
 CAUCHY = 2.385  # deviations at which errors count half: 95 % efficient (Holland and Welsch 1977)
 SAMPLES = 12  # that tell three parameters, those of a plane, or a quantile: four for each
 
+# Log-odds of a look that finds what is in a cell and of one that does not, and their bounds
+# (OctoMap; A. Hornung et al., Autonomous Robots 34 (3), 2013).
+HIT, MISS, ODDS = 0.85, -0.4, (-2.0, 3.5)
+
 
 def quantile(values: Floats, share: float) -> Floats:
     """Of values (..., N), the one (...,) that a share of them is below."""

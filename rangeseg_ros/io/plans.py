@@ -87,12 +87,11 @@ def write_dxf(path: Path, plan: FloorPlan) -> None:
     for start, end in (edge for flight in plan.stairs for edge in flight.edges):
         space.add_line(start, end, dxfattribs={'layer': 'STAIRS'})
     for plane in plan.planes:
-        level = abs(plane.normal[2]) > 0.5 and plane.role != 'ceiling'
         layer = 'FLOOR' if plane.role == 'floor' else 'LEVEL'
         about = {'layer': layer, 'elevation': float(plane.centroid[2])}
         for ring in plane.outline.rings:
             space.add_polyline3d(ring.tolist(), close=True, dxfattribs={'layer': 'PLANES'})
-            if level:
+            if plane.drawn:
                 space.add_lwpolyline(ring[:, :2].tolist(), close=True, dxfattribs=about)
     document.saveas(path)
 

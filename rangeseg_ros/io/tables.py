@@ -6,7 +6,6 @@ import csv
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
-from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +17,9 @@ from rangeseg_ros.core.ground.stairs import Stairs
 from rangeseg_ros.core.rotations import quaternions
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.io.files import replacing
+from rangeseg_ros.messages.clouds import COVARIANCE, EDGE
 
-STAIRS = (
-    *('edge_x1', 'edge_y1', 'edge_z1', 'edge_x2', 'edge_y2', 'edge_z2'),
-    *('width', 'count', 'rise', 'run', 'direction'),
-)
+STAIRS = (*EDGE, 'width', 'count', 'rise', 'run', 'direction')
 """Columns of stairs: ends of the first edge in the frame of the image; metres."""
 GROUND = ('found', 'height', 'confidence', 'tilt')
 """Columns of the ground: whether one is found, how far below the camera it is, metres, how likely
@@ -43,10 +40,7 @@ def _axes(name: str, axes: str = 'xyz') -> list[str]:
 _PARTS: dict[str, tuple[list[str], Callable[[Any], Iterable[Any]]]] = {
     'normal': (_axes('normal'), list),
     'centroid': (_axes('centroid'), list),
-    'covariance': (
-        [f'covariance_{i}{j}' for i, j in combinations_with_replacement('xyzd', 2)],
-        lambda covariance: covariance[np.triu_indices(4)],
-    ),
+    'covariance': (COVARIANCE, lambda covariance: covariance[np.triu_indices(4)]),
     'shape': (
         ['area', 'length', 'width', *_axes('centre'), *_axes('orientation', 'xyzw')],
         lambda shape: [shape.area, *shape.extents, *shape.centre, *quaternions(shape.frame)],

@@ -17,6 +17,7 @@ from rangeseg_ros.core.ground.roles import ROLES
 from rangeseg_ros.core.ground.stairs import Stairs
 from rangeseg_ros.messages.make import CLOUD, Make, MessageError, elements
 
+COVARIANCE = [f'covariance_{i}{j}' for i, j in combinations_with_replacement('xyzd', 2)]
 # One row of `~/planes`: the fields of a Plane.
 PLANE_TYPE = np.dtype(
     [
@@ -26,17 +27,17 @@ PLANE_TYPE = np.dtype(
         *((name, '<f4') for name in ('rms', 'confidence', 'probability', 'area')),
         *((name, '<f4') for name in ('length', 'width', 'centre_x', 'centre_y', 'centre_z')),
         *((f'orientation_{axis}', '<f4') for axis in 'xyzw'),
-        *((f'covariance_{i}{j}', '<f4') for i, j in combinations_with_replacement('xyzd', 2)),
+        *((name, '<f4') for name in COVARIANCE),
     ]
 )
 
 POINT_TYPE = np.dtype([('x', '<f4'), ('y', '<f4'), ('z', '<f4')])
 _HEIGHT_TYPE = np.dtype([*POINT_TYPE.descr, ('height', '<f4')])
-_EDGE = tuple(f'edge_{axis}{end}' for end in (1, 2) for axis in 'xyz')
+EDGE = tuple(f'edge_{axis}{end}' for end in (1, 2) for axis in 'xyz')
 _STAIRS_TYPE = np.dtype(
     [
         *POINT_TYPE.descr,
-        *((name, '<f4') for name in (*_EDGE, 'width', 'rise', 'run')),
+        *((name, '<f4') for name in (*EDGE, 'width', 'rise', 'run')),
         ('count', '<u4'),
         ('direction', '<i4'),
     ]

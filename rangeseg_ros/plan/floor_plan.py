@@ -14,12 +14,12 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.stairs import Stairs
 from rangeseg_ros.core.mapping.adjustment import Solution
 from rangeseg_ros.core.mapping.map_planes import MapPlane, moved_planes
-from rangeseg_ros.core.mapping.plane_grid import HIT, MISS, SURE, PlaneGrid
+from rangeseg_ros.core.mapping.plane_grid import SURE, PlaneGrid
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.rotations import turn_between
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
-from rangeseg_ros.core.significance import chi2_quantile
+from rangeseg_ros.core.significance import HIT, MISS, chi2_quantile
 from rangeseg_ros.core.tracking.plane_errors import moved_plane
 from rangeseg_ros.plan.flights import Flight, flights
 from rangeseg_ros.plan.right_angles import Squared, square_up

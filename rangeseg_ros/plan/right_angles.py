@@ -29,6 +29,11 @@ class Squared(MapPlane):
     exact: str
     turned: float
 
+    @property
+    def drawn(self) -> bool:
+        """Whether plans show its area: it leans by less than 60 degrees, and is no ceiling."""
+        return abs(float(self.normal[2])) > 0.5 and self.role != 'ceiling'
+
 
 def square_up(planes: Sequence[MapPlane], covariance: Floats, tolerance: float) -> list[Squared]:
     """Make planes level or plumb, and walls parallel or at right angles to each other.

@@ -38,7 +38,7 @@ def svg(plan: FloorPlan) -> str:
     box = [left - _MARGIN, top, width * side + 2 * _MARGIN, down]
     level = []
     for plane in plan.planes:
-        if abs(plane.normal[2]) >= 0.5 and plane.role != 'ceiling':
+        if plane.drawn:
             rings = [ring[:, :2] * (1, -1) for ring in plane.outline.rings]
             path = ''.join('M' + 'L'.join(f'{x:.3f} {y:.3f}' for x, y in r) + 'Z' for r in rings)
             fill = _FILLS.get(plane.role, '#ececec')

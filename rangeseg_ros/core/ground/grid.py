@@ -17,10 +17,7 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN, axes_of
 from rangeseg_ros.core.ground.terrain import CellTerrain, Terrain
 from rangeseg_ros.core.rotations import quaternions
-from rangeseg_ros.core.significance import OUTLIER
-
-# Log-odds that a sight of danger adds, that one of ground takes away, and their bounds (OctoMap).
-_HIT, _MISS, _BOUNDS = 0.85, 0.4, (-2.0, 3.5)
+from rangeseg_ros.core.significance import HIT, MISS, ODDS, OUTLIER
 
 
 class GroundGrid(NamedTuple):
@@ -162,9 +159,9 @@ class GroundMemory:
         seen[hit] = seconds
         if kind != GROUND:
             danger[hit] = kind
-            odds[hit] = np.minimum(np.maximum(odds[hit], 0) + _HIT, _BOUNDS[1])
+            odds[hit] = np.minimum(np.maximum(odds[hit], 0) + HIT, ODDS[1])
             return
-        odds[hit] = np.maximum(odds[hit] - _MISS, _BOUNDS[0])
+        odds[hit] = np.maximum(odds[hit] + MISS, ODDS[0])
         mean, square = (
             np.bincount(cells, values[inside])[hit] / number[hit]
             for values in (points[:, 2], errors)

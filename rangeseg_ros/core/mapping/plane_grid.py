@@ -20,13 +20,10 @@ from rangeseg_ros.core.mapping.observations import PlaneSet
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
-from rangeseg_ros.core.significance import OUTLIER
+from rangeseg_ros.core.significance import ODDS, OUTLIER
 
-HIT, MISS, SURE, LEAST = 0.85, -0.4, 2.0, -2.0
-"""Log-odds of a look that finds the plane in a cell, and of one that does not; least log-odds of
-a cell that is sure; lower bound of log-odds. Values of OctoMap.
-"""
-_MOST = 3.5
+SURE = 2.0
+"""Least log-odds of a cell that is sure."""
 # Largest number of cells of a grid: those of larger ones get twice the side, to save memory.
 _CELLS = 2**18
 # Fractional bits of coordinates in OpenCV's polygons.
@@ -110,7 +107,7 @@ class PlaneGrid:
         """Take in a look, `HIT` or `MISS`, at cells (V, U)."""
         if cells.any():
             there, sure = self._there, self._sure
-            self.odds[cells] = np.clip(self.odds[cells] + change, LEAST, _MOST)
+            self.odds[cells] = np.clip(self.odds[cells] + change, *ODDS)
             self._measure()
             if self._whole:
                 self._whole._there += self._there - there

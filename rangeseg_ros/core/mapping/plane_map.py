@@ -20,17 +20,11 @@ from rangeseg_ros.core.mapping.observations import (
     views,
 )
 from rangeseg_ros.core.mapping.plane_filter import Jump, PlaneFilters, find_jump
-from rangeseg_ros.core.mapping.plane_grid import (
-    HIT,
-    MISS,
-    PlaneGrid,
-    in_sight,
-    passed_through,
-    seen_cells,
-)
+from rangeseg_ros.core.mapping.plane_grid import PlaneGrid, in_sight, passed_through, seen_cells
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.significance import HIT, MISS
 from rangeseg_ros.core.tracking.tracker import NOMINAL
 
 _NOWHERE = Transform.identity(), PoseNoise(0.0, 0.0)
