@@ -149,7 +149,8 @@ def _over_scales(
         strata = Strata.of(larger, used)
         level = sum_of_four(level) / 4
         excess = np.maximum(larger.residual - sum_of_four(blocks.residual), 0) / (9 * _MEDIAN)
-        within.append(_ratio(larger, level, used, strata))
+        if len(within) < 3:  # what `_split` takes
+            within.append(_ratio(larger, level, used, strata))
         pixels = _median(larger.moments[..., COUNT], used) / 4
         if larger is scales[1]:
             between = float(strata.medians(excess / level).mean())
@@ -205,7 +206,7 @@ def _split(within: list[float], between: float, filled: float) -> tuple[float, f
     `filled`: planes through these pixels miss the block's own by what sampling leaves of the
     residuals around it, as of a finite population, and count as many times less.
     """
-    shown = np.maximum([*within[:3], between], 1e-9)
+    shown = np.maximum([*within, between], 1e-9)
     hidden = np.array([correlated_residuals(width) for width in _WIDTHS])
     apart = filled * hidden[:, 3] + (1 - filled) * hidden[:, 0]
     other = np.column_stack([hidden[:, : len(shown) - 1], apart]) / shown
