@@ -3,7 +3,7 @@
 python docs/measure_frames.py map SEED...         walks through simulated rooms, against the truth
 python docs/measure_frames.py lies SEED...        poses that drift or jump
 python docs/measure_frames.py loops SEED...       ends of walks by odometry, and solved
-python docs/measure_frames.py odometry SEED...    the same, without poses
+python docs/measure_frames.py odometry SEED...    a second of odometry, against the truth
 python docs/measure_frames.py mount COUNT SEED    cameras in simulated rooms
 python docs/measure_frames.py hour FRAMES         a walk along a corridor, 10 frames a second
 python docs/measure_frames.py real IMAGES POSES CAMERA    frames about their map
