@@ -5,7 +5,7 @@ PYTHON ?= $(shell for python in python3.12 "$$(pyenv prefix 3.12 2>&1)/bin/pytho
   "$$python" -c '' 2>/dev/null && echo "$$python" && break; done)
 VENV ?= .venv
 BIN := $(VENV)/bin
-# Not the wheels of a virtual environment that is active.
+# A sourced ROS 2, not the wheels of an active virtual environment.
 SYSTEM_ROS := $(shell $(PYTHON) -c 'import rclpy, sys; assert sys.prefix == sys.base_prefix' \
   2>/dev/null && echo --system-site-packages)
 
@@ -54,7 +54,7 @@ demo-ros: $(VENV)/installed
 	rm -rf demo/ros
 	$(BIN)/rangeseg simulate kinect --scenes 1 --frames 60 --seed 1 --output demo/ros
 	$(FOR_A_WHILE) $(BIN)/rangeseg play demo/ros/bag --rate 0.3333 --loop & \
-	$(FOR_A_WHILE) $(BIN)/segment_planes & \
+	$(FOR_A_WHILE) $(BIN)/segment_planes --ros-args -p up_y:=-0.94 -p up_z:=-0.34 & \
 	$(FOR_A_WHILE) $(BIN)/python examples/print_planes.py; \
 	wait
 
@@ -76,7 +76,7 @@ MACHINE := $(shell uname -m)
 CPU ?= $(if $(filter x86_64,$(MACHINE)),x86-64-v3,generic)
 wheel: $(VENV)/installed
 	rm -rf build
-	$(BIN)/pip install --quiet setuptools
+	$(BIN)/pip install --quiet 'setuptools>=70.1'
 	RANGESEG_WHEEL=$(CPU) NUMBA_CPU_NAME=$(CPU) NUMBA_CPU_FEATURES= \
 	  $(BIN)/pip wheel --no-deps --no-build-isolation --wheel-dir dist .
 

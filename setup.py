@@ -15,7 +15,7 @@ from setuptools.command.install import install
 
 package_name = 'rangeseg_ros'
 share = f'share/{package_name}'
-# Beside the sources: for symlinks colcon runs one to this file, in a folder without them.
+# The real folder: `colcon build --symlink-install` runs a link to this file elsewhere.
 sources = Path(__file__).resolve().parent
 # Who maintains it, and where it is: `make release-names` writes them there.
 package = ElementTree.parse(sources / 'package.xml').getroot()

@@ -47,7 +47,7 @@ def test_setup_package_xml_and_citation_agree(setup_arguments):
         assert aliases.get(name, name) in keys
     # The messages that are used are named.
     text = '\n'.join(path.read_text() for path in (ROOT / 'rangeseg_ros').rglob('*.py'))
-    used = set(re.findall(r'\b(\w+_(?:msgs|interfaces))(?:/msg/|\.msg )', text))
+    used = set(re.findall(r'\b(\w+_(?:msgs|interfaces))(?:/msg/|\.(?:msg|srv)\b)', text))
     assert {'sensor_msgs', 'rcl_interfaces'} <= used <= declared
 
 
