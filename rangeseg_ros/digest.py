@@ -10,7 +10,7 @@ from pathlib import Path
 
 @cache
 def code_digest() -> bytes:
-    """Digest of every source and template of the package, by name and content."""
+    """Digest of every source and page of the package, by name and content."""
     package = Path(__file__).parent
     digest = hashlib.sha256()
     sources = [path for kind in ('*.py', '*.html') for path in package.rglob(kind)]

@@ -16,8 +16,8 @@ _received = 0
 def watch() -> None:
     """Remember interrupts, which raise KeyboardInterrupt as usual, and SIGTERM and SIGHUP.
 
-    These end the command as errors do: what was begun is put away. Who ignores any of them still
-    does.
+    These end the command as errors do: what was begun is put away. A signal that is ignored stays
+    ignored.
     """
     global _received
     _received = 0
@@ -62,6 +62,11 @@ def _on_signal(number: int, stack: FrameType | None) -> None:
     global _received
     _received = number
     check()
+
+
+def loses(stack: FrameType | None) -> bool:
+    """Whether what is raised there would be printed: while a loss is silenced."""
+    return bool(stack and stack.f_code is _on_loss.__code__)
 
 
 def _on_loss(lost: sys.UnraisableHookArgs) -> None:

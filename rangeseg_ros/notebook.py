@@ -60,16 +60,16 @@ def segment(
     --------
     >>> result = rangeseg_ros.segment(depth, rangeseg_ros.Camera.from_fov(640, 480, 57))
     """
-    for name in parameters.keys() - NAMES:
+    for name in sorted(parameters.keys() - NAMES):
         raise ConfigError(unknown_parameter(name, {'scale', *NAMES}))
     config = Config.from_mapping(parameters)
     if camera is None:
-        image = RangeImage.from_points(depth)
+        image = RangeImage.from_points(depth if scale is None else scale * np.asarray(depth))
     else:
         image = RangeImage.from_depth(depth, camera, scale)
     result = Segmenter(config).segment(corrected(image, config))
     if result.tilt:
-        warnings.warn('up is not as stated, or as of a level camera: result.tilt', stacklevel=2)
+        warnings.warn(f'{result.tilt} (result.tilt)', stacklevel=2)
     return replace(result, planes=with_roles(result.planes, config, result.up))
 
 

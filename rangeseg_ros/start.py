@@ -8,7 +8,7 @@ import signal
 import sys
 
 for number, name in enumerate(('stdin', 'stdout', 'stderr')):
-    # Before a file that is written gets the number of a closed stream, and what is printed there.
+    # Else a file that is written gets the number of a closed stream, and all that is printed.
     if getattr(sys, name) is None:
         stream = os.open(os.devnull, os.O_RDWR)  # the lowest number that is free: this one
         setattr(sys, name, open(stream, 'w' if number else 'r'))  # noqa: SIM115

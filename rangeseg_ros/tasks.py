@@ -17,11 +17,12 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import wait
+from types import FrameType
 from typing import Protocol, TypeVar
 
 import cv2
 
-from rangeseg_ros.interrupts import silence_losses
+from rangeseg_ros.interrupts import loses, silence_losses
 
 R_co = TypeVar('R_co', covariant=True)
 R = TypeVar('R')
@@ -147,12 +148,12 @@ def _begin() -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
-def _exit(number: int, stack: object) -> None:
+def _exit(number: int, stack: FrameType | None) -> None:
     """Raise SystemExit, unless one is on its way and what was begun is being put away."""
     error = sys.exc_info()[1]
     while error and not isinstance(error, SystemExit):
         error = error.__context__
-    if not error:
+    if not (error or loses(stack)):  # the parent asks again
         raise SystemExit(128 + number)
 
 

@@ -44,8 +44,7 @@ os.environ['ROS_DOMAIN_ID'] = next(DOMAINS)
 
 def corner_depth(camera):
     """Depth of two walls that meet in a vertical edge, millimetres: planes -+x + z = 2 m."""
-    x = camera.rays[..., 0]
-    return np.round(1000 * 2 / (1 + np.abs(x))).astype(np.uint16)
+    return np.round(1000 * 2 / (1 + np.abs(camera.rays[..., 0]))).astype(np.uint16)
 
 
 def assert_replayed(bench, folder, topics, count):

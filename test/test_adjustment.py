@@ -180,8 +180,7 @@ def test_the_distortion_of_the_sensor_is_told_from_the_planes():
         planes, views = [], random.uniform(0.1, 1, (len(ids), 12))
         views *= random.random(views.shape) < 0.8
         for face, view in zip(FACES[ids - 1], views, strict=True):
-            shown = distorted(face, truth, view, field)
-            planes.append(observed(random, shown, IDENTITY, ROOT))
+            planes.append(observed(random, distorted(face, truth, view, field), IDENTITY, ROOT))
         about = observations(planes, views, told, NOISE), ids, np.full(len(ids), True)
         for adjustment, rays in zip(adjustments, (RAYS, 0 * RAYS), strict=True):
             adjustment.add(Sighting(told, *about, rays.reshape(-1, 3)))

@@ -62,8 +62,7 @@ def test_bins_are_means_of_what_was_measured(shape, side, cloud):
         # Those of a camera are of the middle of all pixels, were they in the image.
         if not cloud:
             middle = (np.array([j, i]) + 0.5) * side - 0.5
-            expected = [*(middle - 3) / 50, 1]
-            np.testing.assert_allclose(bins.means.rays[i, j], expected, atol=1e-6)
+            np.testing.assert_allclose(bins.means.rays[i, j], [*(middle - 3) / 50, 1], atol=1e-6)
         elif len(known):
             own = rays[part][inverse[part] > 0]
             np.testing.assert_allclose(bins.means.rays[i, j], own.mean(axis=0), rtol=1e-5)
@@ -103,8 +102,7 @@ def test_noise_of_pixels_follows_from_that_of_bins(width, side, power):
 def test_the_model_of_bins_is_that_of_their_means(correlation, white):
     random = np.random.default_rng(4)
     smooth = smooth_field(CAMERA.shape, (2.0, 2.0), random) if correlation else 0.0
-    new = random.normal(0, 1, CAMERA.shape)
-    noise = np.sqrt(white) * new + np.sqrt(1 - white) * smooth
+    noise = np.sqrt(white) * random.normal(0, 1, CAMERA.shape) + np.sqrt(1 - white) * smooth
     means = noise.reshape(240, 2, 320, 2).mean(axis=(1, 3))
     stated = SensorModel.from_config(Config())
     pixels = stated._replace(noise=0.002, white=white, correlation=correlation)

@@ -246,6 +246,8 @@ def test_command_writes_map_parameters_and_report(folder, tmp_path, run):
     output, params = tmp_path / 'map.tiff', tmp_path / 'sensor.yaml'
     camera = ['--camera', folder / 'camera.yaml', '--jobs', 1]
     files = '--output', output, '--params', params
+    (folder / 'x_report.html').write_text('mine')
+    assert 'exists' in run('calibrate', folder / 'depth', *camera, '--output', folder / 'x')[2]
     code, said, error = run('calibrate', folder / 'depth', *camera, *files)
     assert code == 0 and 'less' in said, error
     distortion = read_distortion(output)

@@ -164,17 +164,17 @@ def test_of_four_channels_the_last_is_opacity(tmp_path):
     assert read_mask(tmp_path / 'mask.png').tolist() == expected
 
 
-WRONG = {'mask': 'missing text size', 'distortion_map': 'missing text nan integers'}
+WRONG = {'mask': 'missing text size long', 'distortion_map': 'missing text nan integers'}
 
 
 @pytest.mark.parametrize(('option', 'kind'), [(o, k) for o in WRONG for k in WRONG[o].split()])
 def test_wrong_files_end_the_command_in_one_line(tmp_path, option, kind, segment_image):
-    path = tmp_path / 'file.tiff'
+    path = tmp_path / ('file.tiff' if kind != 'long' else 300 * 'x')
     if kind == 'text':
         path.write_text('text')
     elif kind == 'size':
         cv2.imwrite(str(path), BODY[:-1])
-    elif kind != 'missing':
+    elif kind not in ('missing', 'long'):
         values = np.full(VIEW.shape, np.nan, np.float32)
         cv2.imwrite(str(path), values if kind == 'nan' else np.zeros(VIEW.shape, np.uint16))
     code, _, error = segment_image(robot_on_a_floor(), VIEW, **{option: str(path)})

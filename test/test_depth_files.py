@@ -50,7 +50,7 @@ def write_exr(path, channels):
 
 
 KINDS = ['png', 'pgm', 'float.pfm', 'tiff', 'float.tiff', 'npy', 'int64.npy', 'npz']
-KINDS += ['Z.exr', 'R,G,B,A.exr', 'A.Z,B.R.exr']
+KINDS += ['Z.exr', 'R,G,B,A.exr', 'A.Z,B.R.exr', 'L.Depth.Z,L.Normal.Z.exr']
 
 
 @pytest.mark.parametrize('kind', KINDS)
@@ -59,7 +59,7 @@ def test_images(kind, depth, tmp_path):
     metres = depth.astype(np.float32) / 1000
     if kind.endswith('exr'):
         parts = kind[:-4].split(',')
-        write_exr(path, {name: metres * (name not in ('A', 'B.R')) for name in parts})
+        write_exr(path, {n: metres * (n not in ('A', 'B.R', 'L.Normal.Z')) for n in parts})
     elif kind == 'npz':
         np.savez_compressed(path, colour=np.zeros((48, 64, 3)), depth=metres)
     elif kind.endswith('npy'):
@@ -102,11 +102,13 @@ def test_what_is_none_is_refused_in_one_line(depth, tmp_path):
         ('cols.ply', sized.replace(b'obj_info num_cols ', b'x '), 'not one for each pixel'),
         ('rows.ply', sized.replace(b'obj_info num_rows ', b'x '), 'not one for each pixel'),
         ('text.ply', b'hello end_header', 'not a PLY file'),
+        ('huge.ply', sized.replace(b'vertex ', b'vertex 9999999999999999999'), 'truncated'),
         ('faces.ply', sized.replace(b'element', b'element face 0\nelement', 1), 'no vertices at'),
         ('list.ply', head.format('list uchar int').encode(), 'vertices with lists'),
         ('kind.ply', head.format('float99').encode(), 'vertices with lists'),
         ('text.npy', b'hello', 'not a readable file of NumPy'),
         ('text.npz', b'hello', 'not a readable file of NumPy'),
+        ('cut.npy', b"\x93NUMPY\x01\x00\x0c\x00{'descr': (((", 'not a readable file of NumPy'),
         ('record.bag', b'hello', 'rangeseg replay'),
         ('empty.npz', {}, 'not a readable file of NumPy'),
         ('first.npz', {'Depth': np.ones(5), 'colour': np.ones((4, 5))}, r'\(5,\) float64'),
@@ -157,9 +159,11 @@ def test_intrinsics_of_open3d(tmp_path):
     for content in (flat, {'class_name': 'PinholeCameraParameters', 'intrinsic': flat}):
         (tmp_path / 'camera.json').write_text(json.dumps(content, indent='\t'))
         assert read_camera(tmp_path / 'camera.json') == Camera(64, 48, 60, 61, 31.5, 23.5)
-    (tmp_path / 'camera.json').write_text(json.dumps({'intrinsic_matrix': k}))
-    with pytest.raises(ValueError, match=r'Open3D: .*width'):
-        read_camera(tmp_path / 'camera.json')
+    huge = flat | {'intrinsic_matrix': [10**400, *k[1:]]}
+    for content, words in ((huge, 'too large'), ({'intrinsic_matrix': k}, 'width')):
+        (tmp_path / 'camera.json').write_text(json.dumps(content))
+        with pytest.raises(ValueError, match=f'Open3D: .*{words}'):
+            read_camera(tmp_path / 'camera.json')
 
 
 def test_intrinsics_of_numbers():

@@ -175,8 +175,7 @@ def test_textbook_noise(z, noise):
     scene = in_camera_frame(wall(z, 20))
     true = simulate(scene, Kinect(0, 'none')).depth.astype(float)
     error = simulate(scene, Kinect(0, noise), seed=3).depth / 1000 - true
-    quantisation = QUANTUM * true**2 / np.sqrt(12)
-    expected = np.hypot(0.0012 + 0.0019 * (true - 0.4) ** 2, quantisation)
+    expected = np.hypot(0.0012 + 0.0019 * (true - 0.4) ** 2, QUANTUM * true**2 / np.sqrt(12))
     # 300,000 pixels, or 20,000 independent ones when correlated.
     assert (error / expected).std() == pytest.approx(1, abs=0.03)
     assert (error / expected).mean() == pytest.approx(0, abs=0.03)

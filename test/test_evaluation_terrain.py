@@ -78,6 +78,7 @@ def test_shares_and_pictures_are_those_counted_on_paper(drawn, figures_of, tmp_p
     """But beside borders and beyond a sensor's reach, of a drop by the ground in its place."""
     code, figures, out, _ = figures_of(*EVALUATE, drawn, '--output', tmp_path / 'pictures')
     assert code == 0 and figures['images'] == 2
+    assert 'exists already' in figures_of(*EVALUATE, drawn, '--output', tmp_path / 'pictures')[3]
     assert figures['by_kind'] == {'far': pytest.approx(REALSENSE), 'near': pytest.approx(KINECT)}
     assert figures['pooled'] == pytest.approx(POOLED)
     # Obstacles of 0.05 m are floor 2 m away, that of 0.4 m is found, 1.6 m away.

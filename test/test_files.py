@@ -131,7 +131,7 @@ WIDE = f'a: &a {{{"".join(f"{k}: 1, " for k in range(3000))}}}\nb: [{"*a, " * 90
         ('3: 4', 'unknown parameter 3'),
         ('node: {ros__parameters: {smoothness: 1.0}}', 'no ros__parameters of segment_planes'),
         ('segment_planes: {ros__parameters: [1, 2]}', 'no mapping'),
-        ('min_pixels: 3\nsegment_planes: {ros__parameters: {}}', 'no section'),
+        ('min_pixels: 3\nsegment_planes: {ros__parameters: {}}', 'has no ros__parameters'),
         ('noise: 1' + '0' * 400, 'noise must be in'),
         ('min_pixels: 1' + '0' * 400, 'min_pixels must be in'),
         ('[' * 20000, 'nested too deeply'),

@@ -8,6 +8,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rangeseg_ros.evaluation.hoover import RegionClass, classify
+from rangeseg_ros.evaluation.label_files import as_truth
 from rangeseg_ros.evaluation.overlap import ComparisonError, Overlap, overlap_figures
 from rangeseg_ros.evaluation.plane_errors import angle_errors, plane_errors
 
@@ -27,6 +28,8 @@ def overlap(*runs):
 def test_labels_are_integers():
     with pytest.raises(ComparisonError, match='integers'):
         Overlap.between(np.zeros((2, 2)), np.zeros((2, 2), int))
+    with pytest.raises(ComparisonError, match='differ in size'):
+        as_truth(np.full((3, 3), 65535, np.uint16), 1).compare(np.ones((2, 2), np.uint16))
 
 
 def literal(truth, labels, tolerance):
@@ -93,9 +96,10 @@ def test_figures_are_of_the_best_assignment_and_pooled_over_images():
 
 def test_angle_errors_of_correct_pairs():
     normals = {5: (0, 0, -1), 6: (0, -1, 0), 7: (0, np.sin(0.1), np.cos(0.1))}
-    matches = {10: 5, 11: 6, 12: 7}
-    # 5-6 is 90 degrees, 5-7 0.1 rad; 13 has no match. Between planes, 174 degrees are 6.
-    angles, off = [(10, 11, 88.0), (10, 12, 0.0), (11, 13, 45.0), (10, 12, 174.0)], np.degrees(0.1)
+    matches = {10: 5, 11: 6, 12: 7, 14: 8}
+    # 5-6 is 90 degrees, 5-7 0.1 rad; 13 has no match, 14 no plane. 174 degrees are 6.
+    angles = [(10, 11, 88.0), (10, 12, 0.0), (11, 13, 45.0), (10, 14, 3.0), (10, 12, 174.0)]
+    off = np.degrees(0.1)
     assert angle_errors(angles, normals, matches) == pytest.approx([2.0, off, 6 - off])
     assert angle_errors([], normals, matches).shape == (0,)
 

@@ -134,8 +134,7 @@ def test_image_errors_name_what_is_wrong():
 
 
 def _compressed(image, a=0.0, b=0.0):
-    png = cv2.imencode('.png', image)[1].tobytes()
-    return struct.pack('<iff', 0, a, b) + png
+    return struct.pack('<iff', 0, a, b) + cv2.imencode('.png', image)[1].tobytes()
 
 
 @pytest.mark.parametrize('format', ['16UC1; compressedDepth png', '16UC1; compressedDepth'])

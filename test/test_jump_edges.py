@@ -140,8 +140,7 @@ def test_shadow_alone_makes_no_edge(detect):
     inverse = ramp(0.0003, 0.0002)
     for shadow in (np.s_[20:40, 30:50], np.s_[60, 10:100], np.s_[70:90, 80]):
         inverse[shadow] = 0
-    horizontal, vertical = detect(image_of(inverse))
-    assert not horizontal.any() and not vertical.any()
+    assert not any(map(np.any, detect(image_of(inverse))))
 
 
 @pytest.mark.parametrize('height', [0.2, -0.2])
@@ -169,9 +168,8 @@ def test_bridging_joins_neighbours_that_do_not_touch():
 def test_small_images(shape):
     image = RangeImage(np.ones((*shape, 3), np.float32), np.ones(shape, np.float32))
     for edges in (plane_deviation(image, STEP), sobel(image)):
-        assert edges[0].shape == (shape[0], shape[1] - 1)
-        assert edges[1].shape == (shape[0] - 1, shape[1])
-        assert not edges[0].any() and not edges[1].any()
+        assert [e.shape for e in edges] == [(shape[0], shape[1] - 1), (shape[0] - 1, shape[1])]
+        assert not any(map(np.any, edges))
 
 
 @pytest.mark.parametrize('seed', range(3))

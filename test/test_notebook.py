@@ -18,7 +18,7 @@ from rangeseg_ros.io.images import write_image
 
 @pytest.fixture(scope='module')
 def result(seen):
-    with pytest.warns(UserWarning, match='up is not as stated'):
+    with pytest.warns(UserWarning, match='up as stated, or of a level camera, is off'):
         return rangeseg_ros.segment(seen.depth, seen.camera)
 
 
@@ -28,6 +28,8 @@ def test_one_call_gives_what_the_segmenter_gives(seen, result):
     assert 'wall' in {plane.role for plane in result.planes}
     scaled = rangeseg_ros.segment(seen.depth / 1000, seen.camera, min_pixels=3000)
     assert 0 < len(scaled.planes) < len(result.planes)
+    points = rangeseg_ros.segment(1000 * image.points, scale=0.001)
+    assert points.planes[0].distance == pytest.approx(result.planes[0].distance, rel=1e-3)
 
 
 def test_texts_are_short(seen, result):

@@ -108,8 +108,7 @@ def test_the_ends_of_a_box_tell_the_motion_along_two_walls():
     alone, aided = PlaneOdometry(), PlaneOdometry()
     for k in range(0, 13, 2):
         planes, view = planes_of(scene, k, 5)
-        depth = simulate(scene, Kinect(0), CAMERA, frame=k).depth
-        image = RangeImage.from_depth(depth, CAMERA)
+        image = RangeImage.from_depth(simulate(scene, Kinect(0), CAMERA, frame=k).depth, CAMERA)
         result = Segmenter().segment(image)
         edges = JumpPoints.of(image, result.jumps, result.cells)
         held = [n for n, plane in enumerate(planes) if abs(plane.normal @ up) < 0.5]

@@ -111,6 +111,10 @@ def test_the_largest_of_16_bits_stays_unmeasured_when_it_is_packed(folder, run):
         with DepthBag(folder / bag) as frames:
             (frame, _) = frames
         assert frame.depth.dtype == kind and not frame.range_image().valid.any()
+    write_image(folder / 'depth' / '2.png', np.full((48, 64), 100, np.uint8))
+    run('pack', 'depth', *CAMERA, '--output', 'bag8')
+    with DepthBag(folder / 'bag8') as frames:
+        assert next(iter(frames)).depth.max() == np.float32(0.1)
 
 
 def test_a_lens_is_not_ignored_in_silence(folder, run, recwarn):

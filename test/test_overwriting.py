@@ -64,6 +64,8 @@ def test_figures_replace_figures_alone(folder, run, refused):
     before = Path('depth/10.png').read_bytes()
     assert 'exists already' in refused(*compare, 'depth/10.png')
     assert Path('depth/10.png').read_bytes() == before
+    Path('camera.json').write_text(json.dumps({'width': 64}, indent=2))
+    assert 'exists already' in refused(*compare, 'camera.json')
     assert 'no such folder' in refused(*compare, 'nowhere/x.json')
     assert not Path('nowhere').exists()
     # What begins as figures do may be replaced, and what is empty.

@@ -132,6 +132,8 @@ def test_the_first_frames_wait_for_labels_and_other_outputs_for_their_kernels(co
     assert used.in_use() is first
     used.want(other)  # needs no other kernels
     assert used.in_use() is other and not used.pending
+    used._use(first)  # a thread that has not heard of the other one yet
+    assert used.in_use() is other
     assert used.ready_for('labels') and compilation.came == [FIRST]
     Timer(0.2, compilation.release.set).start()
     assert used.ready_for('terrain') and set(compilation.came[1]) > set(FIRST)
@@ -272,8 +274,7 @@ def test_what_is_found_is_told_and_what_is_wrong(found, level, message):
 @pytest.mark.parametrize('transport', [-1.5, 3.6e6, 3.6e6 + 1, -3.7e6])
 def test_the_latency_is_unknown_where_stamps_are_not_of_the_clock_of_the_node(transport):
     """They are more than `stall_timeout` apart from it, which is an hour."""
-    times = FrameTimes(transport, 2.0, 3.0, 4.0, 5.0, {'refining': 3.5})
-    told = values_of(status(times=times))
+    told = values_of(status(times=FrameTimes(transport, 2.0, 3.0, 4.0, 5.0, {'refining': 3.5})))
     values = {name: value for name, value in told.items() if 'ms' in name}
     parts = {'waiting': 2, 'conversion': 3, 'compute': 4, 'compute: refining': 3.5}
     expected = {'latency since arrival': 14, **parts, 'publication': 5}

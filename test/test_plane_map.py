@@ -270,8 +270,7 @@ def test_of_too_many_planes_those_out_of_sight_the_longest_are_forgotten():
 def test_a_grid_is_bounded_however_far_a_plane_goes():
     grid = PlaneGrid(0.03)
     for x in range(60):
-        found = grid.fill([[np.array([[x, 0], [x + 1.2, 0], [x + 1.2, 40], [x, 40.0]])]])
-        grid.add(found, HIT)
+        grid.add(grid.fill([[np.array([[x, 0], [x + 1.2, 0], [x + 1.2, 40], [x, 40.0]])]]), HIT)
     assert grid.odds.size <= 2**18 and grid.side == 0.12
     assert grid.area == pytest.approx(60.2 * 40, rel=0.01)
 

@@ -102,8 +102,7 @@ def test_abw_points_are_the_published_ones(number, split, constants):
     # The published z counts from range value 255 towards the sensor, whose centre is where
     # x = y = 0 for all pixels, so where v / scale + offset = 0.
     centre = 255 / scale + offset
-    rays = calibration.camera.rays[R, C].astype(float)
-    points = 1000 * rays * calibration.depth(v)[:, None]
+    points = 1000 * calibration.camera.rays[R, C].astype(float) * calibration.depth(v)[:, None]
     assert points == pytest.approx(np.stack([x, -y, centre - z], axis=1), rel=1e-6)
     assert np.isnan(calibration.depth(0))
 

@@ -69,8 +69,7 @@ def test_faces_of_a_noise_free_room_are_found(seed):
     for one, other in matches.items():
         # Pixels of other faces tilt a plane.
         if np.mean(frame.labels[result.labels == other] == one) >= 0.99:
-            cosine = min(1.0, found[other].normal @ truth[one].normal)
-            assert np.degrees(np.arccos(cosine)) < 0.3
+            assert np.degrees(np.arccos(min(1.0, found[other].normal @ truth[one].normal))) < 0.3
             assert found[other].distance == pytest.approx(truth[one].distance, abs=0.01)
 
 

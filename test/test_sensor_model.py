@@ -190,8 +190,7 @@ def test_what_noise_hides_is_not_made_more_of(seed):
     rows, columns = (0.004 * np.abs(np.arange(n) / 60 % 2 - 1) for n in CAMERA.shape)
     creases = columns + rows[:, None]
     depth = 2 + np.arange(480)[:, None] / 960 + creases
-    noise = np.random.default_rng(seed).normal(0, 0.02, CAMERA.shape)
-    sensor = sensor_of(1 / (depth + noise))
+    sensor = sensor_of(1 / (depth + np.random.default_rng(seed).normal(0, 0.02, CAMERA.shape)))
     assert sensor.range_noise == pytest.approx(0.02, rel=0.05)
     assert sensor.distortion < 1.5 * (creases / depth**2).std()
 
@@ -286,6 +285,5 @@ def test_what_is_said_of_the_errors():
 def test_what_every_second_pixel_does_not_tell_all_pixels_do():
     """Strips of eight pixels beside such as were not measured: no block of 16 is whole."""
     field = smooth_field(CAMERA.shape, (2.0, 2.0), np.random.default_rng(8))
-    measured = np.arange(640) // 8 % 2 == 0
-    sensor = sensor_of(np.where(measured, three_planes() + 0.02 * field, 0))
+    sensor = sensor_of(np.where(np.arange(640) // 8 % 2 == 0, three_planes() + 0.02 * field, 0))
     assert sensor.correlation >= 1 and sensor.noise == pytest.approx(0.02, rel=0.4)

@@ -105,8 +105,7 @@ def test_the_map_turns_with_its_frame():
             np.testing.assert_allclose(twin.normal, normal, atol=1e-9)
             assert twin.distance == pytest.approx(plane.distance - normal @ moved.shift, abs=1e-9)
             covariance = jacobian @ plane.covariance @ jacobian.T
-            near = 1e-6 * covariance.max()
-            np.testing.assert_allclose(twin.covariance, covariance, atol=near)
+            np.testing.assert_allclose(twin.covariance, covariance, atol=1e-6 * covariance.max())
             assert (twin.id, twin.observations) == (plane.id, plane.observations)
             assert twin.area == pytest.approx(plane.area)
     for pose, twin in zip(solution.poses, other.poses, strict=True):

@@ -96,8 +96,8 @@ class SightingsOfPart:
     after: int
     kept: Path
 
-    def run(self) -> Seen:
-        """Segment the frames, or read what is kept."""
+    def run(self) -> Seen | None:
+        """Segment the frames, or read what is kept; None where none can be read."""
         where = self.source.path
         settings = where.absolute(), self.source, asdict(self.config), self.first, self.after
         recorded = where.iterdir() if where.is_dir() else [where]
@@ -114,7 +114,7 @@ class SightingsOfPart:
             image = corrected(image, self.config)
             frames.append(find_sightings(segmenter.segment(image).labels, image))
         if shape is None:
-            raise CalibrationError(f'{self.source.path}: no frames')
+            return None
         sightings = concatenate(frames)
         told = json.dumps(camera and asdict(camera))
         with replacing(path) as partial:
@@ -149,9 +149,10 @@ class ResidualsOfFrame:
     frame: int
     distortion: DistortionMap
 
-    def run(self) -> Residuals:
-        """Segment the frame without and with the correction."""
-        (image,) = self.source.images(self.frame, self.frame + 1)
+    def run(self) -> Residuals | None:
+        """Segment the frame without and with the correction; None where it cannot be read."""
+        if (image := next(self.source.images(self.frame, self.frame + 1), None)) is None:
+            return None
         image = corrected(image, self.config)
         segmenter, pictures, counts = Segmenter(self.config), [], []
         for version in (image, self.distortion.corrected(image)):

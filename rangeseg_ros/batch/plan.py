@@ -184,8 +184,7 @@ class PlanTask:
                 if pose := poses.get(done + source.lost.total()):
                     image = corrected(frame.range_image(), config)
                     image = solution.corrected(image, config.distortion_length)
-                    points = points_within(image, sensor, self.resolution) - image.place
-                    yield pose.apply(points)
+                    yield pose.apply(points_within(image, sensor, self.resolution) - image.place)
 
     def _open(self) -> DepthBag:
         return DepthBag(self.recording, self.depth_topic, self.camera_topic)

@@ -118,8 +118,7 @@ class Replay:
             results = _Results(self, made.path, add_planes, bag, located)
             streams = [results.messages(source, progress)]
             if self.copy:
-                originals = stack.enter_context(open_source(self.recording))
-                streams.append(bag.copies(originals))
+                streams.append(bag.copies(stack.enter_context(open_source(self.recording))))
             bag.write_merged(*streams)
             outcome = results.finish(source)
             bag.record({'key': key, 'outcome': asdict(outcome), 'files': made.digest()})

@@ -85,11 +85,8 @@ class ResultBag(BagWriter):
         What is damaged is left out; `lost` counts it.
         """
         own = {connection.topic for connection in self._topics.values()}
-        here = {
-            (connection.topic, connection.msgtype): self._like(connection)
-            for connection in source.connections
-            if connection.topic not in own
-        }
+        kinds = {(c.topic, c.msgtype): c for c in source.connections if c.topic not in own}
+        here = {kind: self._like(connection) for kind, connection in kinds.items()}
         for record in source.records({topic for topic, _ in here}):
             if isinstance(record, Lost):
                 self.lost[f'{record.topic}: {record.reason}'] += record.messages

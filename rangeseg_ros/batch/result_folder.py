@@ -40,7 +40,7 @@ class ResultFolder:
     def check(self, recording: Path, overwrite: bool) -> None:
         """Raise BagError when something is there that is no replay's, and may not be replaced."""
         source = resolved(recording)
-        if resolved(self.bag) in (source, *source.parents):
+        if resolved(self.path) == source or resolved(self.bag) in (source, *source.parents):
             raise BagError(f'{self.bag}: exists already, not overwritten: it is the recording')
         if overwrite or read_record(self.bag):
             return
@@ -52,7 +52,8 @@ class ResultFolder:
     def replacing(self) -> Iterator[ResultFolder]:
         """Give a folder for results, which take the place of earlier ones once all are there."""
         for left in self.path.glob(f'{TEMPORARY}*'):  # of a process that was killed
-            shutil.rmtree(left, ignore_errors=True)
+            if left.name.removeprefix(TEMPORARY).isdigit():
+                shutil.rmtree(left, ignore_errors=True)
         unfinished = ResultFolder(self.path / f'{TEMPORARY}{os.getpid()}')
         unfinished.path.mkdir(parents=True)
         try:

@@ -18,9 +18,10 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.distortion import DistortionError
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.distortion import read_distortion, write_distortion
-from rangeseg_ros.io.files import replacing
+from rangeseg_ros.io.files import NotReplacedError, replacing
 from rangeseg_ros.io.params import read_config, read_params
 from rangeseg_ros.report.calibration import Shown, write_calibration
+from rangeseg_ros.report.page import page_kind
 from rangeseg_ros.tasks import run_all
 
 # Frames that the report shows.
@@ -61,7 +62,7 @@ def command(
     An interrupted run goes on where it was when it is started again.
     """
     report = output.with_name(f'{output.stem}_report.html')
-    _check_free(output, params)
+    _check_free(output, params, report)
     camera = read_camera(camera_file) if camera_file else None
     sources = [Source(path, camera, **given) for path in recordings]
     for source in sources:
@@ -73,7 +74,9 @@ def command(
     config = read_config(segment_with, distortion_map='')
     kept = output.with_name(f'.{output.name}.parts')
     tasks = parts(sources, config, kept)
-    seen = list(options.progress(run_all(tasks, jobs), len(tasks), 'part'))
+    seen = [each for each in options.progress(run_all(tasks, jobs), len(tasks), 'part') if each]
+    if not seen:
+        raise click.ClickException(f'{", ".join(map(str, recordings))}: no frames')
     result = calibrate(*_together(seen))
     _report(result)
 
@@ -92,13 +95,13 @@ def command(
         with replacing(params) as partial:
             partial.write_text(_HEADER + yaml.safe_dump(parameters, sort_keys=False))
     pairs = zip(chosen.tolist(), left, strict=True)
-    shown = [Shown(number, frame.images, frame.planes) for number, frame in pairs]
+    shown = [Shown(number, frame.images, frame.planes) for number, frame in pairs if frame]
     write_calibration(report, [path.name for path in recordings], result, parameters, shown)
     shutil.rmtree(kept, ignore_errors=True)
     click.echo(f'{output}, {report}')
 
 
-def _check_free(output: Path, params: Path | None) -> None:
+def _check_free(output: Path, params: Path | None, report: Path) -> None:
     """Refuse to overwrite what is none of this command's own."""
     if output.exists():
         try:
@@ -107,6 +110,8 @@ def _check_free(output: Path, params: Path | None) -> None:
             raise click.UsageError(f'{output}: exists already, and is no distortion map') from None
     if params:
         options.check_replaceable(params, _HEADER.encode())
+    if report.exists() and page_kind(report) != 'calibration':
+        raise NotReplacedError(report)
 
 
 def _together(seen: list[Seen]) -> tuple[Sightings, tuple[int, int], Any]:

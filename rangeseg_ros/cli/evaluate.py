@@ -8,6 +8,7 @@ import click
 
 from rangeseg_ros.cli import options
 from rangeseg_ros.cli.compare import ToleranceCommand, tolerance
+from rangeseg_ros.compilation.preparation import prepare, show
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.evaluation.datasets import find_cases
 from rangeseg_ros.evaluation.detection import detection_table, detections
@@ -67,6 +68,9 @@ def command(
     """
     if (folder / 'terrain.csv').exists():
         terrains = terrain_tasks(folder, config, not unknown_height, output)
+        if output:
+            options.check_new([terrain.picture for terrain in terrains], [], overwrite)
+        prepare(config, ('image',), show, ('terrain',))
         measured = list(options.progress(run_all(terrains, jobs), len(terrains), 'image'))
         figures = terrain_figures(measured)
         click.echo(f'{folder}: {len(measured)} images')
@@ -85,6 +89,7 @@ def command(
         outputs = [path for task in tasks for path in task.pictures(output).values()]
         inputs = [path for case in cases for path in (case.image, case.truth)]
         options.check_new(outputs, inputs, overwrite)
+    prepare(config, ('image',), show, ())
     found = list(options.progress(run_all(tasks, jobs), len(tasks), 'image'))
     figures = evaluation_figures(found, tolerances)
     click.echo(f'{folder}: {len(cases)} images, method {config.method}')

@@ -185,14 +185,16 @@ def _checked_json(
     if path:
         if not path.parent.is_dir():
             raise click.ClickException(f'{path}: no such folder')
-        check_replaceable(path, b'{')
+        # As `write_json` writes figures.
+        first = b'method' if context.info_name == 'bench' else b'images'
+        check_replaceable(path, b'{\n  "' + first + b'"')
     return path
 
 
 json_file: Decorator = click.option(
     '--json',
     'json_file',
-    type=click.Path(path_type=Path),
+    type=click.Path(dir_okay=False, path_type=Path),
     callback=_checked_json,
     help='Write the figures to this file.',
 )

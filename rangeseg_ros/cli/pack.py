@@ -62,10 +62,10 @@ def command(
     with DepthBagWriter(output, camera) as bag:
         for index, path in enumerate(options.progress(paths, len(paths), 'image')):
             depth = read_depth(path, camera.shape)
-            if depth.dtype != np.uint16:
+            if depth.dtype.kind == 'f':
                 depth = np.float32(depth_scale or 1) * depth.astype(np.float32)
-            elif depth_scale not in (None, 0.001):
-                metres = np.float32(depth_scale) * depth.astype(np.float32)
+            elif depth.dtype != np.uint16 or depth_scale not in (None, 0.001):
+                metres = np.float32(depth_scale or 0.001) * depth.astype(np.float32)
                 depth = np.where(depth == NOT_MEASURED, np.float32(np.nan), metres)
             # Time 0 means 'not set' in ROS, so the first image is at one second.
             stamp = 10**9 + round(index * 1e9 / rate)

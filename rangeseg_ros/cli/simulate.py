@@ -38,7 +38,7 @@ _sensor = options.choice(
     'without error.',
 )
 _of_all_sets = options.together(
-    options.number('--seed', default=0, help='Of the first scene; the others have the next ones.'),
+    options.number('--seed', default=0, help='Of the first scene; each further one adds 1.'),
     click.option('--width', type=_size, help="Columns; the sensor's own."),
     click.option('--height', type=_size, help="Rows; the sensor's own."),
     options.output_folder('Folder to make; it must not exist, or be empty.'),

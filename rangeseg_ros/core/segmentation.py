@@ -164,8 +164,7 @@ class Segmentation:
             plane.label: -plane.normal / (plane.distance + plane.normal @ place)
             for plane in self.planes
         }
-        doubts = self.identified, self.values
-        return judge(self.image, self.labels, thetas, self.curved, *doubts)
+        return judge(self.image, self.labels, thetas, self.curved, self.identified, self.values)
 
     def of_pixels(self, labels: Labels, image: RangeImage, cells: Cells) -> Segmentation:
         """The result of the image whose `cells` it is of, with labels (H, W) of its pixels."""

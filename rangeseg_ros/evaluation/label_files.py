@@ -37,10 +37,10 @@ class Truth(NamedTuple):
         """Overlap of a segmentation with this truth.
 
         Where only some pixels are judged, the label 65535 is no region in the segmentation
-        either, and a found region does not count of which less than half of the pixels, and
-        fewer than `min_pixels`, are judged: the rim of something unjudged is no evidence.
+        either, and a found region does not count if less than half of its pixels, and fewer than
+        `min_pixels`, are judged: the rim of something unjudged is no evidence.
         """
-        if self.judged is not None:
+        if self.judged is not None and self.judged.shape == labels.shape:
             sizes = np.bincount(labels.ravel(), minlength=NOT_PLANAR + 1)
             seen = np.bincount(labels[self.judged], minlength=NOT_PLANAR + 1)
             ignored = (2 * seen < sizes) & (seen < self.min_pixels)

@@ -22,7 +22,7 @@ def angle_errors(
     """
     errors = []
     for first, second, degrees in angles:
-        if first in matches and second in matches:
+        if {matches.get(first), matches.get(second)} <= normals.keys():
             found = _angle(*(np.asarray(normals[matches[label]]) for label in (first, second)))
             errors.append(abs(min(degrees, 180.0 - degrees) - min(found, 180.0 - found)))
     return np.array(errors)

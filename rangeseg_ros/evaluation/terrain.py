@@ -56,8 +56,8 @@ class Shares(NamedTuple):
 
     `obstacles` (2, len(SIZES), 4) are pixels of obstacles by height and distance in whole metres,
     and those that were found. `confidence` is that the ground seen is the one that the robot
-    stands on; `own`, whether it is: most of what is called ground, or where nothing is, of the
-    nearest hundredth of the pixels.
+    stands on; `own`, whether it is: by most of the pixels called ground or, if there are none, of
+    the nearest hundredth.
     """
 
     name: str
@@ -80,6 +80,12 @@ class TerrainTask:
     row: dict[str, str]
     config: Config
     output: Path | None = None
+
+    @property
+    def picture(self) -> Path:
+        """Where the picture of the image is left."""
+        kind = self.row['kind'].replace(' ', '_')
+        return (self.output or Path()) / f'{self.row["name"]}_{kind}.png'
 
     def run(self) -> Shares:
         """Segment the image and count its pixels."""
@@ -113,7 +119,7 @@ class TerrainTask:
         if self.output:
             wrong = judged & (found != truth)
             picture = np.hstack([_COLOURS[truth], _COLOURS[found], _COLOURS[found * wrong]])
-            write_image(self.output / f'{name}_{self.row["kind"].replace(" ", "_")}.png', picture)
+            write_image(self.picture, picture)
         return Shares(name, self.row['kind'], pixels, obstacles, stairs, confidence, own)
 
 
@@ -158,6 +164,8 @@ def terrain_tasks(
                 if not know_height:
                     known['sensor_height'] = 0.0
                 tasks.append(TerrainTask(folder, dict(row), replace(config, **known), output))
+            if not tasks:
+                raise ValueError
         except (KeyError, TypeError, ValueError, csv.Error):
             raise EvaluationError(f'{path}: malformed table of terrains') from None
     return tasks

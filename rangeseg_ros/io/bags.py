@@ -33,8 +33,8 @@ class DepthBag(Closing):
     says. Where no topic has images, the frames are the only point clouds, which need no camera.
     `camera` is that of images without a camera_info.
 
-    `lost` counts why frames were left out while iterating; `damage` is for those who iterate to
-    note what ended it.
+    `lost` counts why frames were left out while iterating; whoever iterates notes in `damage`
+    what ended the iteration.
 
     BagError: not a recording, or one without depth images or camera_info (the message lists its
     topics), or without any image of a known encoding that its camera_info fits. DamagedBagError:
@@ -204,5 +204,4 @@ class DepthBag(Closing):
 
 def _sibling_camera_info(image_topic: str) -> str:
     """Topic of the intrinsics, by the convention of image_transport."""
-    base = re.sub(r'/compressed(Depth)?$', '', image_topic)
-    return base.rpartition('/')[0] + '/camera_info'
+    return re.sub(r'/compressed(Depth)?$', '', image_topic).rpartition('/')[0] + '/camera_info'

@@ -28,7 +28,7 @@ def read_camera(path: Path, raw: bool = False) -> Camera:
         try:
             k = np.array(inner['intrinsic_matrix'], float).reshape(3, 3).T
             return Camera(inner['width'], inner['height'], k[0, 0], k[1, 1], k[0, 2], k[1, 2])
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise CameraError(f'{path}: not intrinsics of Open3D: {error}') from None
     try:
         return camera_from_calibration(calibration, raw or None)

@@ -9,10 +9,8 @@ from typing import Any
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.options import ConfigError
-from rangeseg_ros.core.sensing.distortion import DistortionError
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.io.distortion import read_distortion
-from rangeseg_ros.io.files import FileError
 from rangeseg_ros.io.images import read_mask
 
 
@@ -62,7 +60,7 @@ def check_corrections(config: Config) -> None:
         try:
             if file := getattr(config, parameter):
                 load(Path(file))
-        except (FileError, DistortionError) as error:
+        except (ValueError, OSError) as error:
             raise ConfigError(f'parameter {parameter}: {error}') from None
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,7 +36,7 @@ def files_of(folder: Path, suffixes: Collection[str] = IMAGES) -> list[Path]:
 def files_in(path: Path) -> list[Path]:
     """Frames of a folder, FileError where there are none; a file itself.
 
-    Those of a subfolder `depth` where there is one, and only those named so where some are.
+    Of its subfolder `depth` where there is one; where some names contain `depth`, only these.
     """
     if not path.is_dir():
         return [path]
@@ -103,7 +102,11 @@ def read_frame(path: Path, intrinsics: Intrinsics, scale: float | None = None) -
         raise FileError(f'{path}: a recording; rangeseg replay {path} segments it')
     else:
         array = read_depth(path, known)
+    if not array.size:
+        raise FileError(f'{path}: no pixels, {array.shape}')
     if array.ndim == 3 and array.shape[2] == 3:
+        if array.shape[0] == 1 < array.shape[1]:
+            raise FileError(f'{path}: cloud is not organised ({array.shape[1]}x1)')
         return RangeImage.from_points(array * np.float32(scale or 1))
     return RangeImage.from_depth(array, intrinsics.of(array.shape), scale)
 
@@ -115,7 +118,7 @@ def _read_numpy(path: Path, shape: tuple[int, int] | None) -> NDArray:
             with array as arrays:
                 names = {name.lower(): name for name in arrays.files}
                 array = arrays[names.get('depth', arrays.files[0])]
-    except (OSError, ValueError, EOFError, IndexError, zipfile.BadZipFile):
+    except Exception:  # damaged bytes raise errors of every kind
         raise FileError(f'{path}: not a readable file of NumPy') from None
     if array.ndim != 2 and (array.ndim != 3 or array.dtype.kind != 'f'):
         raise FileError(
@@ -129,9 +132,11 @@ def _read_exr(path: Path) -> Singles:
         channels = import_extra('OpenEXR').File(str(path), separate_channels=True).channels()
     except (RuntimeError, ValueError, OSError):
         raise FileError(f'{path}: not a readable EXR file') from None
-    # Renderers write Z or V, maybe of a layer; grey images have Y, or R, G and B alike.
-    last = {name.rpartition('.')[2]: np.asarray(channels[name].pixels) for name in channels}
-    kinds = [kind for kind in ('Z', 'V', 'Y', 'depth') if kind in last] or sorted({*last} - {'A'})
-    if len(kinds) > 1 and any(not np.array_equal(last[kinds[0]], last[k]) for k in kinds):
+    # Renderers write Z or V, maybe of a layer Depth; grey images have Y, or R, G and B alike.
+    names = [n for n in channels if n.rpartition('.')[2] in ('Z', 'V', 'Y', 'depth')]
+    names = [n for n in names if 'depth' in n.lower()] or names
+    names = names or [n for n in channels if n[-1] != 'A']
+    found = [np.asarray(channels[n].pixels).astype(np.float32) for n in names]
+    if not found or any(not np.array_equal(found[0], x, equal_nan=True) for x in found):
         raise FileError(f'{path}: which is depth? Its channels: {", ".join(channels)}')
-    return last[kinds[0]].astype(np.float32)
+    return found[0]

@@ -64,7 +64,7 @@ def _sections(path: Path, content: dict[Any, Any]) -> Iterator[tuple[str, dict[A
     """Last part of the name of each node, which namespaces may surround, and its parameters."""
     for name, part in content.items():
         if not isinstance(part, dict):
-            raise ConfigError(f'{path}: {name} is no section with ros__parameters')
+            raise ConfigError(f'{path}: {name} has no ros__parameters')
         if 'ros__parameters' not in part:
             yield from _sections(path, part)
             continue

@@ -160,7 +160,7 @@ def _write_yaml(path: Path, plan: FloorPlan) -> None:
     x, y = plan.origin
     path.write_text(
         'image: map.pgm\nmode: trinary\n'
-        f'resolution: {plan.resolution:g}\norigin: [{x:.6g}, {y:.6g}, 0.0]\nnegate: 0\n'
+        f'resolution: {plan.resolution:g}\norigin: [{x:.9g}, {y:.9g}, 0.0]\nnegate: 0\n'
         f'occupied_thresh: {_OCCUPIED_THRESHOLD}\nfree_thresh: {_FREE_THRESHOLD}\n'
     )
 

@@ -48,7 +48,7 @@ def read_ply(path: Path, shape: tuple[int, int] | None = None) -> NDArray[np.flo
             kind = np.dtype([(name, sign + _TYPES[word]) for word, name in fields])
             records = np.frombuffer(body, kind, count)
         points = np.stack([records[axis].astype(np.float32) for axis in 'xyz'], axis=-1)
-    except (ValueError, KeyError, MemoryError):
+    except (ValueError, KeyError, MemoryError, OverflowError):
         raise FileError(f'{path}: truncated, or without x, y, z') from None
     said = [re.search(rf'\b(?:{"|".join(words)})\s+(\d+)', header) for words in _SIZES]
     if said[0] and said[1]:

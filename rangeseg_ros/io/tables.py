@@ -28,7 +28,7 @@ it is the floor that the robot stands on, and degrees between the stated up and 
 
 
 def _points(points: NDArray) -> str:
-    return ';'.join(' '.join(f'{x:.6g}' for x in point) for point in points)
+    return ';'.join(' '.join(f'{x:.9g}' for x in point) for point in points)
 
 
 def _axes(name: str, axes: str = 'xyz') -> list[str]:

@@ -84,5 +84,4 @@ def fixed_frame_of(path: Path) -> str:
         while above[-1] in parents and parents[above[-1]] not in above:
             above.append(parents[above[-1]])
         found.add(above[-1])
-    order = ['map', 'odom', 'world', *sorted(found)]
-    return next((name for name in order if name in found), '')
+    return next((name for name in ['map', 'odom', 'world', *sorted(found)] if name in found), '')

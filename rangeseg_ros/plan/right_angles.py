@@ -84,8 +84,7 @@ class _Conditions:
 
     def impose(self, rows: Floats, gap: Floats) -> bool:
         """Have `rows` of the values change by `gap`, unless that is too far."""
-        spread = rows @ self.covariance @ rows.T
-        inverse = np.linalg.pinv(spread)
+        inverse = np.linalg.pinv(rows @ self.covariance @ rows.T)
         if gap @ inverse @ gap > chi2_quantile(len(gap)):
             return False
         gain = self.covariance @ rows.T @ inverse

@@ -44,11 +44,16 @@ def check_arguments(arguments: list[str]) -> None:
     if '-h' in own or '--help' in own:
         known = ((f.name, f.default, f.metadata['description']) for f in fields(NodeConfig))
         lines = (f'  {name} (default {value!r}): {does}' for name, value, does in known)
-        print(USAGE + '\n'.join(lines))  # at once, for who reads the first lines alone
+        try:
+            os.write(1, f'{USAGE}{chr(10).join(lines)}\n'.encode())
+        except BrokenPipeError:
+            pass  # the reader has seen enough
+        except OSError as error:
+            raise ConfigError(f'--help: {error.strerror}') from None
         sys.exit(0)
     if own:
         raise ConfigError(
-            f'unknown argument {own[0]!r}; parameters are given as --ros-args -p NAME:=VALUE'
+            f'unknown argument {own[0]!r}; ROS arguments follow --ros-args, as in -p NAME:=VALUE'
         )
 
 
@@ -57,7 +62,7 @@ def check_parameters(node: Node, arguments: list[str]) -> None:
 
     Those that a parameter file has for nodes of any name may be meant for others, and
     `qos_overrides` for other topics: they are warned of. ConfigError names what is refused, also a
-    quality of service that there is none of.
+    quality of service that does not exist.
     """
     quality = _quality_parameters(node)
     for name in sorted(quality & set(node._parameter_overrides)):

@@ -18,7 +18,7 @@ class LatestReady(Generic[Item]):
     """Gives the newest item that is ready, and drops the items before it.
 
     An item that is not ready does not block others; it is given once its waiting time is over.
-    `delay` tells of an item and the seconds that it has waited how many more it has to wait, 0
+    `delay(item, waited)`: how many more seconds an item has to wait that has waited so long; 0
     when it is ready.
     """
 

@@ -44,7 +44,7 @@ class Reading(NamedTuple):
     acceleration: Floats
 
     def followed_by(self, new: Reading) -> Reading:
-        """The new reading smoothed by this one; as it is in another frame or earlier in time."""
+        """The new reading, smoothed by this one unless its frame differs or it is earlier."""
         elapsed = (new.stamp - self.stamp) * 1e-9
         if new.frame != self.frame or elapsed < 0:
             return new

@@ -29,8 +29,8 @@ class Pace:
     all the same, would just have lasted the period P with the share b (P - o) / r. Its logarithm,
     as a median of three and through a low-pass filter of first order, is what the share is told
     from: the largest of a few steps that is enough at once where that is less, one step more when
-    it has been well possible for some time. `rate` is to be held, Hz, 0 leaves `most`: the largest
-    share of the work, 0...1.
+    it has been well possible for some time. `rate`, Hz, is to be held (0: none); `most` is the
+    largest share of the work, 0...1.
     """
 
     def __init__(self, rate: float, most: float) -> None:
@@ -39,7 +39,7 @@ class Pace:
         self._steps = [most, *less]
         self._step = 0
         self._period = 1 / (_HEADROOM * rate) if rate else math.inf
-        # A share that is further off than twice says no more.
+        # Shares beyond twice these limits say no more than the limits.
         self._bounds = _share(self._steps[-1]) / 2, 2 * _share(most)
         self._latest: deque[float] = deque(maxlen=3)
         self._enough = self._bounds[1]

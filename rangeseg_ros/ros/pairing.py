@@ -38,7 +38,7 @@ class StampPairing:
         self._items[stamp] = item
         if len(self._items) > KEPT:
             self._items.popitem(last=False)
-        # It came after its image, which was not known to wait for.
+        # It came after its image, for which nobody knew that it had to wait.
         self.by_stamp |= stamp == self._asked
 
     def find(self, stamp: int) -> Found | None:

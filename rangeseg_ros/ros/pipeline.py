@@ -136,8 +136,7 @@ class Pipeline:
         ticks.append(time.perf_counter())
         doing(f'segmenting {image.shape[1]}x{image.shape[0]} pixels')
         at = self.locator.place(config, frame)
-        found = work.segmenter.segment(image)
-        return Segmented(frame, image, found, at, start, ticks)
+        return Segmented(frame, image, work.segmenter.segment(image), at, start, ticks)
 
     def _finish(self, work: Work, segmented: Segmented | Exception) -> None:
         """Do what takes frames one after the other, publishing included."""
@@ -195,19 +194,20 @@ class Pipeline:
     def _tell(self, sequence: SequenceSegmenter, at: Placement) -> None:
         """Report where up and the frames come from."""
         statistics, config = self._statistics, sequence.config
-        statistics.sources = dict(at.sources)
+        sources = dict(at.sources)
         statistics.missing = '; '.join(f'{what} {why}' for what, why in at.missing.items())
         if config.map_frame:
             count = len(sequence.map)
             anew = f', begun anew: {why}' if (why := sequence.map.begun_anew) else ''
-            statistics.sources['map'] = f'{count} planes in {config.map_frame}{anew}'
+            sources['map'] = f'{count} planes in {config.map_frame}{anew}'
             if doubts := sequence.map.doubts:
-                statistics.sources['poses'] = doubts[-1]
+                sources['poses'] = doubts[-1]
             if len(sequence.map.jumps) > self._jumps:
                 self._node.get_logger().warning(str(sequence.map.jumps[-1][1]))
             self._jumps = len(sequence.map.jumps)
         if sequence.motion:
-            statistics.sources['odometry'] = f'{sequence.motion.held} planes'
+            sources['odometry'] = f'{sequence.motion.held} planes'
+        statistics.sources = sources
         if statistics.missing:
             self._node.get_logger().warning(statistics.missing, throttle_duration_sec=5.0)
 

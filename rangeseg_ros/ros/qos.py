@@ -20,8 +20,8 @@ class MatchedSubscription:
 
     The middleware's own `best_available` policy looks once, when the subscription is made, and
     takes a topic without publishers for a reliable one. Here the choice is made anew when
-    publishers come or go. The parameter `qos_overrides.<topic>.subscription.reliability` ends it.
-    `losses` counts the messages that arrive and those that are lost.
+    publishers come or go; `qos_overrides.<topic>.subscription.reliability` decides where it is
+    set. `losses` counts the messages that arrive and those that are lost.
     """
 
     def __init__(

@@ -80,7 +80,9 @@ class Settings:
 
     def _use(self, config: NodeConfig) -> None:
         with self._came:
-            self._in_use = config
+            # Another thread may have asked for another one by now.
+            if config is self.wanted or self._in_use is None:
+                self._in_use = config
             self._came.notify_all()
         self._on_change()
 
@@ -95,8 +97,7 @@ class Settings:
             self._prepared.add(_needs(config))
             self._report('')
             self.busy = False
-            if config is self.wanted:
-                self._use(config)
+            self._use(config)
 
     def _prepare(self, config: NodeConfig, outputs: tuple[str, ...]) -> None:
         # What cannot be compiled will be reported by the frame that needs it.

@@ -25,7 +25,7 @@ class TruePlane:
 
     normal . p + distance = 0, with the unit normal (3,) towards the sensor. `label` is its value
     in the truth image, 1...; `face` the number of its face in the scene, which persists from frame
-    to frame, and which all regions share into which occluders cut the face.
+    to frame and is shared by all regions into which occluders cut the face.
     """
 
     label: int

@@ -178,8 +178,7 @@ class _Room:
     def add_ball(self) -> None:
         """Add a ball that lies on the floor."""
         radius = self.random.uniform(0.15, 0.3)
-        place = self._free_place(radius, 1.3, 2.3)
-        self.solids.append(sphere(radius, (*place, radius)))
+        self.solids.append(sphere(radius, (*self._free_place(radius, 1.3, 2.3), radius)))
 
     def add_cylinder(self) -> None:
         """Add a cylinder that stands on the floor."""

@@ -43,8 +43,7 @@ def segment(
     """Give every pixel a direction; `lap` is told the name of every stage that ends."""
     normals = observed_normals(image, grid, config)
     lap('normals')
-    unturned = directions(config.direction_count)
-    labels_of = (unturned @ image.axes.T).astype(np.float32)
+    labels_of = (directions(config.direction_count) @ image.axes.T).astype(np.float32)
     minimiser = minimise_exactly if config.exact else minimise
     labels = minimiser(normals, labels_of, grid, config.smoothness)
     lap('labels')

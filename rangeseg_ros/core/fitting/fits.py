@@ -73,8 +73,7 @@ def _total_least_squares(total: Floats, theta: Floats) -> Floats:
     """Planes of the smallest mean square distance, in the place of those that `theta` has."""
     count = np.maximum(total[:, COUNT], 1)
     mean = total[:, POINT:SCATTER] / count[:, None]
-    triangle = total[:, SCATTER : SCATTER + 6] / count[:, None]
-    scatter = triangle[:, SYMMETRIC]
+    scatter = (total[:, SCATTER : SCATTER + 6] / count[:, None])[:, SYMMETRIC]
     far = np.sqrt(np.trace(scatter, axis1=1, axis2=2))
     normal = np.linalg.eigh(scatter - mean[:, :, None] * mean[:, None])[1][:, :, 0]
     distance = -(normal * mean).sum(axis=1)

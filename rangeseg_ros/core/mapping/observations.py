@@ -171,8 +171,7 @@ def observations(
     tilt = share * np.pi / np.maximum([plane.area for plane in planes], 1e-4)
     covariance[:, range(3), range(3)] += np.stack([tilt, tilt, share], axis=1)
     seen = seen.moved(pose)
-    by_pose = seen.by_motion(pose.shift) * noise.deviations
-    return Observations(seen, covariance, by_pose, view)
+    return Observations(seen, covariance, seen.by_motion(pose.shift) * noise.deviations, view)
 
 
 def continuity(before: Floats, now: Floats) -> Floats:

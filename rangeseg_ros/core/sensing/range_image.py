@@ -181,8 +181,7 @@ class RangeImage:
         cloud = np.where(known[..., None], array, 0).astype(np.float64)
         with np.errstate(over='ignore'):
             inverse = _reciprocal(np.sqrt(np.einsum('ijk,ijk->ij', cloud, cloud)), 1.0)
-        rays = (cloud * inverse[..., None]).astype(np.float32)
-        image = cls(rays, inverse)
+        image = cls((cloud * inverse[..., None]).astype(np.float32), inverse)
         image._doubt_unit()
         return image
 

@@ -84,8 +84,8 @@ def piece_scene(
 ) -> Terrain:
     """A test piece, seen from `mount` metres above the ground by a camera aimed 1.5 m ahead.
 
-    The same seed gives the same place across the view, direction and errors of what is stated, or
-    a `random` generator that has `uniform` does.
+    Place across the view, direction and errors of what is stated follow from `seed` or, where it
+    is given, from `random`, of which `uniform` is called.
     The `kind` of the scene is that of the piece with its size and distance.
     """
     site = Site(f'{kind} {size:g} {distance:g}', seed)
