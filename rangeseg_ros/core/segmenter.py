@@ -92,7 +92,7 @@ class Segmenter:
             )
         if config.mask and image.body is None:
             raise RangeImageError('mask is not applied yet: segment corrected(image, config)')
-        # BinsTask before it is known whether the values are those of depth.
+        # Begun before it is known whether the values are those of depth.
         begun = Task(_binned, image, self._side(image))
         if (q := encoding(image)) is not None:
             depth = decoded(image, q)

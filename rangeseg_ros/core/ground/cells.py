@@ -1,7 +1,7 @@
-"""GroundCells of a few pixels: what the ground is looked for in, and continued in.
+"""Cells of a few pixels: what the ground is looked for in, and continued in.
 
 A cell is the mean of its pixels, which for a plane is a point of the plane: theta . ray = inverse
-is linear. GroundCells are wider than high, because the ground recedes along the columns.
+is linear. Cells are wider than high, because the ground recedes along the columns.
 
 The ground continued is a plane for every cell. Each block's plane is fitted to the ground in a
 window around it, with that of the whole image as its prior, whose own is the plane under the robot
@@ -31,7 +31,7 @@ or not known, ground, in the way, below.
 """
 # Rows of an image whose cells are 1 x 2 pixels.
 _ROWS = 120
-# GroundCells of a block of the ground continued, which is about square.
+# Cells of a block of the ground continued, which is about square.
 _DOWN, _RIGHT = 4, 2
 # The prior counts as so much of a window full of ground: it decides where little of it is seen.
 _PRIOR = 1 / 16
@@ -218,7 +218,7 @@ def _fitted(sums: Floats, prior: Floats) -> Floats:
     moments[..., :6] += _PRIOR * seen[..., :6]
     moments[..., 6:9] += _PRIOR * (seen[..., SYMMETRIC] * prior).sum(axis=3)
     theta = fit_all(moments.reshape(-1, SIZE))[0].reshape(*ground.shape[:2], 3)
-    known = theta.any(axis=2) & (ground[..., 5] > 0)
+    known = theta.any(axis=2) & ground[..., [0, 3, 5]].any(axis=2)
     return np.where(known[..., None], theta, prior)
 
 

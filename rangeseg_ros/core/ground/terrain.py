@@ -32,7 +32,7 @@ from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # Standard deviations of noise: the ground errs by no more, and what errs by more is none.
 _CERTAIN = 3.0
-# GroundCells among which noise keeps some out of a chain, and over which relief is measured.
+# Cells among which noise keeps some out of a chain, and over which relief is measured.
 _AROUND = np.ones((5, 5), np.uint8)
 SURE = 0.99
 """Least confidence with which ground counts as ground; with less, it is unknown."""
@@ -227,7 +227,7 @@ def _without_ground(
 
 
 def _faces(cells: GroundCells, config: Config) -> Mask:
-    """GroundCells (rows, columns) of surfaces that rise more steeply than any ground."""
+    """Cells (rows, columns) of surfaces that rise more steeply than any ground."""
     steep = np.zeros(cells.inverse.shape, np.bool_)
     if len(steep) < 3:
         return steep
