@@ -103,6 +103,5 @@ def record(path, storage, images, compressed=False):
     recording = Recording(ros1=storage == 'rosbag1')
     for index, image in enumerate(images):
         recording.add_camera(stamp_of(index), image.shape[1], image.shape[0])
-        add = recording.add_compressed if compressed else recording.add_image
-        add(stamp_of(index), image)
+        (recording.add_compressed if compressed else recording.add_image)(stamp_of(index), image)
     return recording.write(path, storage)

@@ -125,3 +125,6 @@ def test_a_band_has_the_sites_so_near_to_a_label(reach, rows):
         assert sorted(found) == np.flatnonzero(reached & (labels != alpha)).tolist() != []
         assert (labelling.position[found] == np.arange(len(found))).all()
         assert np.count_nonzero(labelling.position >= 0) == len(found)
+        won = labelling._replace(labels=np.where(labelling.position < 0, labels.ravel(), alpha))
+        after = expansion.beyond(alpha, found, won, rows)
+        assert inside.flat[after].all() and (won.labels[after] != alpha).all()

@@ -25,8 +25,7 @@ def cylinder(radius, distance=2.0):
     # Nearer root of (z x)^2 + (z - c)^2 = r^2.
     centre = distance + radius
     root = centre**2 - (1 + X**2) * (centre**2 - radius**2)
-    depth = (centre - np.sqrt(np.maximum(root, 0))) / (1 + X**2)
-    return np.where(root > 0, 1 / depth, 0)
+    return np.where(root > 0, (1 + X**2) / (centre - np.sqrt(np.maximum(root, 0))), 0)
 
 
 NO_PAIRS = np.zeros((0, 2), np.uint16)
@@ -190,8 +189,7 @@ def test_a_crease_stays_in_its_place_where_the_sensor_bends_the_planes():
         bent, noise = (smooth_field(camera.shape, (w, w), random) for w in (35.0, 2.0))
         inverse = 0.25 + 0.25 * np.abs(column) + 0.002 * bent + 0.0012 * noise
         image = RangeImage.from_depth((1 / inverse).astype(np.float32), camera)
-        labels = Segmenter().segment(image).labels
-        edge = (np.diff(labels) != 0) & (np.abs(column[:, 1:]) < 0.1)
+        edge = (np.diff(Segmenter().segment(image).labels) != 0) & (np.abs(column[:, 1:]) < 0.1)
         away.append(np.where(edge, np.abs(np.arange(639) - 319), 99).min(axis=1))
     # Without shifts, half.
     assert np.mean(np.array(away) <= 2) > 0.75
