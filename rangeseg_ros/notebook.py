@@ -64,7 +64,7 @@ def segment(
         raise ConfigError(unknown_parameter(name, {'scale', *NAMES}))
     config = Config.from_mapping(parameters)
     if camera is None:
-        image = RangeImage.from_points(depth if scale is None else scale * np.asarray(depth))
+        image = RangeImage.from_points(depth if scale is None else scale * np.asanyarray(depth))
     else:
         image = RangeImage.from_depth(depth, camera, scale)
     result = Segmenter(config).segment(corrected(image, config))

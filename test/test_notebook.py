@@ -28,8 +28,8 @@ def test_one_call_gives_what_the_segmenter_gives(seen, result):
     assert 'wall' in {plane.role for plane in result.planes}
     scaled = rangeseg_ros.segment(seen.depth / 1000, seen.camera, min_pixels=3000)
     assert 0 < len(scaled.planes) < len(result.planes)
-    points = rangeseg_ros.segment(1000 * image.points, scale=0.001)
-    assert points.planes[0].distance == pytest.approx(result.planes[0].distance, rel=1e-3)
+    points = rangeseg_ros.segment(np.ma.masked_less(1000 * image.points, -1000), scale=0.001)
+    assert points.planes[0].distance < 10 and not points.labels[(image.points < -1).any(2)].any()
 
 
 def test_texts_are_short(seen, result):

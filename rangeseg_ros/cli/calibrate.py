@@ -77,6 +77,8 @@ def command(
     seen = [each for each in options.progress(run_all(tasks, jobs), len(tasks), 'part') if each]
     if not seen:
         raise click.ClickException(f'{", ".join(map(str, recordings))}: no frames')
+    if lost := sum(t.after - t.first for t in tasks) - sum(part.sightings.frames for part in seen):
+        click.echo(f'rangeseg: {lost} frames left out that cannot be read', err=True)
     result = calibrate(*_together(seen))
     _report(result)
 
