@@ -13,7 +13,6 @@ from rangeseg_ros.core.arrays import Ints, Labels, Singles
 from rangeseg_ros.core.by_planes.plane_energy import CAP, NO_PLANE, Models
 from rangeseg_ros.core.by_planes.shifts import shift_at
 from rangeseg_ros.core.sensing.blocks import NODE
-from rangeseg_ros.core.sensing.enlargement import Cells
 from rangeseg_ros.core.sensing.moments import ray_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
@@ -36,14 +35,12 @@ def with_sharp_borders(
     Given are the regions (h, w) of bins, which have `side` pixels along their side, and the labels
     (h, w) of these among the planes of `models`. A border between two pixels costs `prior`.
     """
-    labels = Cells(side, 0, 0).enlarged(regions, image.shape) * image.valid
     pixels = image.inverse, image.rays, image.pinhole
-    _settle(regions, surfaces, models, *pixels, sensor, prior, side, labels)
-    return labels
+    return _with_sharp_borders(regions, surfaces, models, *pixels, sensor, prior, side)
 
 
 @njit(cache=True, nogil=True)
-def _settle(
+def _with_sharp_borders(
     regions: Labels,
     surfaces: Ints,
     models: Models,
@@ -53,10 +50,16 @@ def _settle(
     sensor: SensorModel,
     prior: float,
     side: int,
-    labels: Labels,
-) -> None:
-    """Give pixels of bins beside others the label of the lowest cost, in place."""
-    (rows, columns), (height, width) = regions.shape, labels.shape
+) -> Labels:
+    (rows, columns), (height, width) = regions.shape, inverse.shape
+    labels, line = np.empty((height, width), np.uint16), np.empty(columns * side, np.uint16)
+    for i in range(rows):
+        for j in range(columns):
+            for v in range(side):
+                line[j * side + v] = regions[i, j]
+        for u in range(i * side, min((i + 1) * side, height)):
+            for v in range(width):
+                labels[u, v] = line[v] * (inverse[u, v] > 0)
     names, planes = np.empty(_LABELS, np.uint16), np.empty(_LABELS, np.intp)
     nearer, near = np.empty(_LABELS), np.empty(4, np.uint16)
     for i in range(rows):
@@ -77,26 +80,28 @@ def _settle(
                     label = int(np.intp(surfaces[u, v])) if regions[u, v] > 0 else 0
                     planes[c] = label
                     nearer[c] = 1 + shift_at(models.shifts, label, i // NODE, j // NODE)
-            for k in range(side * side):
-                u, v = i * side + k // side, j * side + k % side
-                if u >= height or v >= width or inverse[u, v] == 0:
-                    continue
-                others = 0
-                for a, b in ((u - 1, v), (u, v - 1), (u + 1, v), (u, v + 1)):
-                    if 0 <= a < height and 0 <= b < width and inverse[a, b] > 0:
-                        near[others], others = labels[a, b], others + 1
-                y, least = np.float64(inverse[u, v]), np.inf
-                ray = ray_of(rays, pinhole, u, v)
-                weight = 1 / random_variance(sensor, y * y)
-                for c in range(count):
-                    name, label, cost = names[c], planes[c], NO_PLANE
-                    if label > 0:
-                        level = models.theta[label, 0] * ray[0] + models.theta[label, 1] * ray[1]
-                        level += models.theta[label, 2] * ray[2]
-                        square = weight * (y - nearer[c] * level) ** 2
-                        cost = min(models.half_precision[label] * square, CAP)
-                    for other in near[:others]:
-                        cost += prior * (other != name)
-                    if cost < least:
-                        best, least = name, cost
-                labels[u, v] = best
+            for u in range(i * side, min((i + 1) * side, height)):
+                for v in range(j * side, min((j + 1) * side, width)):
+                    if inverse[u, v] == 0:
+                        continue
+                    others = 0
+                    for a, b in ((u - 1, v), (u, v - 1), (u + 1, v), (u, v + 1)):
+                        if 0 <= a < height and 0 <= b < width and inverse[a, b] > 0:
+                            near[others], others = labels[a, b], others + 1
+                    y, least = np.float64(inverse[u, v]), np.inf
+                    ray = ray_of(rays, pinhole, u, v)
+                    weight = 1 / random_variance(sensor, y * y)
+                    for c in range(count):
+                        name, label, cost = names[c], planes[c], NO_PLANE
+                        if label > 0:
+                            level = models.theta[label, 0] * ray[0]
+                            level += models.theta[label, 1] * ray[1]
+                            level += models.theta[label, 2] * ray[2]
+                            square = weight * (y - nearer[c] * level) ** 2
+                            cost = min(models.half_precision[label] * square, CAP)
+                        for other in range(others):
+                            cost += prior * (near[other] != name)
+                        if cost < least:
+                            best, least = name, cost
+                    labels[u, v] = best
+    return labels

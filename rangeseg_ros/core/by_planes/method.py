@@ -12,6 +12,7 @@ from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, costs
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.graphcut.expansion import energy
+from rangeseg_ros.core.runtime.threads import Task
 from rangeseg_ros.core.sensing.grid import View
 
 
@@ -39,8 +40,9 @@ def segment(view: View, config: Config, lap: Callable[[str], None]) -> Labelling
     lap('blocks')
     smoothness = config.plane_smoothness
     patches = find_patches(nodes, sensor)
+    begun = Task(Problem.of, whole, sensor, view.grid, smoothness)
     surface, moments = join_surfaces(*patches, nodes, view, smoothness)
-    problem = Problem.of(whole, sensor, view.grid, smoothness)
+    problem = begun.result()
     lap('surfaces')
     labels, models = refine(problem, surface, nodes.moments, moments, sensor)
     lap('labels')
