@@ -135,10 +135,10 @@ MECHANISMS = (
               {'by_planes.method.find_patches': _without_distortion_length}),
     Mechanism('parts merge by the energy', 'by_planes/surfaces.py:_apart',
               {'by_planes.method.join_surfaces': _given(4, _NO_BORDER),
-               'segmenter.unite_regions': _given(2, _NO_BORDER)}),
+               'segmenter.unite_regions': _given(3, _NO_BORDER)}),
     Mechanism('regions that touch unite', 'by_planes/surfaces.py:unite_regions',
-              {'segmenter.unite_regions': lambda _: lambda regions, *rest:
-               (regions, np.zeros((0, 2), np.uint16))}),
+              {'segmenter.unite_regions': lambda _: lambda regions, sums, *rest:
+               (regions, np.zeros((0, 2), np.uint16), sums)}),
     Mechanism('planes shifted by the distortion', 'by_planes/shifts.py',
               {'by_planes.labelling.shifts':
                lambda _: lambda surfaces, blocks, theta, *rest: Shifts.none(len(theta))}),

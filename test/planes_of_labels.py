@@ -6,15 +6,21 @@ from rangeseg_ros import Config, Plane, RangeImage
 from rangeseg_ros.core.description.planes import describe_regions
 from rangeseg_ros.core.description.shapes import Shape
 from rangeseg_ros.core.fitting.fits import Fits
+from rangeseg_ros.core.fitting.region_sums import sum_regions
 from rangeseg_ros.core.mapping.map_planes import MapOutline
+from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
 SQUARE = ((-1, -1, 2), (-1, 1, 2), (1, 1, 2), (1, -1, 2))
 
 
+def fits_of(labels, image, sensor):
+    return Fits.of(sum_regions(labels, image, Blocks.of(image), sensor), sensor, not image.camera)
+
+
 def fit_planes(labels, image, sensor):
     """Plane of every region, fitted and described as those of a segmentation."""
-    fits = Fits.of(labels, image, sensor)
+    fits = fits_of(labels, image, sensor)
     return describe_regions(labels, image, fits, fits.roots(), sensor)
 
 

@@ -13,7 +13,7 @@ from rangeseg_ros import Camera, RangeImage
 from rangeseg_ros.core.fitting.region_sums import POINT, sum_regions
 from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, roots, squares
 from rangeseg_ros.core.sensing.blocks import Blocks
-from rangeseg_ros.core.sensing.moments import COUNT
+from rangeseg_ros.core.sensing.moments import COUNT, RATIO
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
 from rangeseg_ros.simulation.fields import smooth_field
 from rangeseg_ros.simulation.sensors.kinect import QUANTUM, kinect_camera
@@ -187,7 +187,8 @@ def test_sums_of_regions_are_those_over_their_pixels(form):
     labels = (labels * (draw.random(labels.shape) > 0.01)).astype(np.uint16)
     inverse[draw.random(labels.shape) < 0.01] = 0
     image = form(RangeImage(camera.rays, inverse.astype(np.float32), camera))
-    sums, total = sum_regions(labels, image, Blocks.of(image), sensor)
+    sums = sum_regions(labels, image, Blocks.of(image), sensor)
+    total = sums.total()
     whole = labels.reshape(15, 4, 18, 4).transpose(0, 2, 1, 3).reshape(15, 18, 16)
     whole = (whole == whole[..., :1]).all(axis=2).repeat(4, 0).repeat(4, 1)
     for label in (1, 2, 3):
@@ -209,6 +210,35 @@ def test_sums_of_regions_are_those_over_their_pixels(form):
         assert 16 < len(cells) <= 64 and (cells[:, COUNT] > 0).all()
         first, after = np.argwhere(labels == label).min(0), np.argwhere(labels == label).max(0) + 1
         np.testing.assert_array_equal(sums.box[label], [*first, *after])
+
+
+@FORMS
+def test_sums_of_united_regions_are_those_of_their_parts(form):
+    """Regions 1 and 3 are united; 2 remains, with its cells; 4 goes."""
+    draw, sensor = np.random.default_rng(3), SensorModel(0.001, 1e-3, 1, 0, 2e-3, 1e-3, 35)
+    camera = Camera(72, 60, 90.0, 95.0, 30.0, 33.0)
+    labels = draw.permutation(np.arange(30) % 5).reshape(5, 6).repeat(12, 0).repeat(12, 1)
+    inverse = (camera.rays @ [0.1, 0.2, 0.5]).astype(np.float32)
+    image = form(RangeImage(camera.rays, inverse, camera))
+    sums = sum_regions(labels.astype(np.uint16), image, Blocks.of(image), sensor)
+    united = sums.united(np.array([0, 1, 2, 1, 0], np.uint16))
+    for found, parts in ((united.total(), sums.total()), (united.pixels, sums.pixels)):
+        np.testing.assert_allclose(found[1:], [parts[1] + parts[3], parts[2]], rtol=1e-9)
+    own, before = (s.cells[s.start[2] : s.start[3]] for s in (united, sums))
+    np.testing.assert_array_equal(own, before)
+    moments = united.moments(sensor)
+    assert len(united.start) == 4 and united.start[2] <= 64 and not moments[0].any()
+    for k, mask in enumerate([(labels == 1) | (labels == 3), labels == 2], 1):
+        places = np.argwhere(mask)
+        assert united.box[k].tolist() == [*places.min(axis=0), *places.max(axis=0) + 1]
+        rays, y = image.rays[mask].astype(float), image.inverse[mask].astype(float)
+        parts = y, 1 / random_variance(sensor, y**2), places
+        expected, scale = (record(r, *parts)[: COUNT + 1] for r in (rays, np.abs(rays)))
+        # Cells of clouds have one weight each.
+        off = np.abs(moments[k, : COUNT + 1] - expected) / scale
+        assert off.max() < (0.001 if image.camera else 0.02)
+        ratio = parts[1] @ systematic_variance(sensor, y**2)
+        assert moments[k, RATIO] == pytest.approx(ratio, rel=0.001)
 
 
 def test_a_plane_by_another_name_is_the_same_plane():

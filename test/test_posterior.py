@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from planes_of_labels import fits_of
 from scipy.ndimage import binary_dilation, convolve, find_objects
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.by_planes.posterior import _evidence, plane_probabilities
 from rangeseg_ros.core.by_planes.shifts import shift_at, shifts
-from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.region_sums import INVERSE, PLACE, RAY, WEIGHT
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
@@ -38,7 +38,7 @@ def fitted(inverse, regions, seed=0, times=1):
     error += 0.5 * times * smooth_field(CAMERA.shape, (13.0, 22.0), random)
     seen = np.where(inverse > 0, inverse + QUANTUM * error, 0).astype(np.float32)
     sensor = SENSOR._replace(distortion=times * SENSOR.distortion)
-    return Fits.of(regions.astype(np.uint16), RangeImage(CAMERA.rays, seen, CAMERA), sensor)
+    return fits_of(regions.astype(np.uint16), RangeImage(CAMERA.rays, seen, CAMERA), sensor)
 
 
 def probabilities(inverse, regions, seed=0, pairs=NO_PAIRS, times=1):
@@ -74,7 +74,7 @@ def test_rows_and_columns_are_alike(bend):
 
     def probability(inverse):
         image = RangeImage(camera.rays, inverse.astype(np.float32), camera)
-        return plane_probabilities(Fits.of(whole, image, sensor), NO_PAIRS, 0.5)[1]
+        return plane_probabilities(fits_of(whole, image, sensor), NO_PAIRS, 0.5)[1]
 
     one, other = probability(inverse), probability(inverse.T)
     assert one == pytest.approx(other, rel=1e-6) and 0.2 < one < 0.9

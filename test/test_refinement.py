@@ -9,14 +9,13 @@ from rangeseg_ros import Camera, Config, RangeImage
 from rangeseg_ros.core.by_planes import labelling as refinement
 from rangeseg_ros.core.by_planes.labelling import refine
 from rangeseg_ros.core.by_planes.patches import Nodes, find_patches
-from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, costs, region_moments
+from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, costs
 from rangeseg_ros.core.by_planes.shifts import Shifts, shift_at
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.graphcut.expansion import GridLabelling, energy, fronts, minimise
 from rangeseg_ros.core.regions import connected_components
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.grid import Grid, View, grid_of
-from rangeseg_ros.core.sensing.moments import RATIO
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room
@@ -185,19 +184,3 @@ def test_the_energy_is_nearly_that_of_expansions_to_all_pixels():
     minimise(labelling, len(cost), lambda k, pixels: cost[k, pixels])
     least = energy_of(everywhere, problem, models)
     assert least <= energy_of(labels, problem, models) < 1.05 * least
-
-
-def test_moments_of_regions_are_sums_over_their_pixels():
-    problem, _, labels = random_case(3, 17, 13)
-    image = RangeImage(problem.rays.reshape(17, 13, 3), problem.inverse.reshape(17, 13))
-    moments = region_moments(labels, 4, image, SENSOR)
-    assert not moments[0].any()
-    for label in range(1, 4):
-        mask = labels.ravel() == label
-        pixels = problem.rays, problem.inverse, problem.weight
-        rays, y, w = (part[mask].astype(float) for part in pixels)
-        square = np.einsum('n,ni,nj->ij', w, rays, rays)[np.triu_indices(3)]
-        expected = [*square, *(w * y) @ rays, w @ y**2, mask.sum(), w.sum() * 0.003**2]
-        np.testing.assert_allclose(moments[label, : RATIO + 1], expected, rtol=1e-9)
-    theta = Models.of(moments, SENSOR.distortion_pixels).theta
-    assert not theta[0].any() and theta[1:].any(axis=1).all()

@@ -17,6 +17,7 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane, describe_regions
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.noise import measured_sensor, nested, quantisation
+from rangeseg_ros.core.fitting.region_sums import sum_regions
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.options import ConfigError
@@ -141,21 +142,23 @@ class Segmenter:
             valid, errors = view.whole.valid, SensorModel.from_config(config, image.shape)
         regions = plane_regions(labelling.labels, valid, view.grid, view.min_pixels)
         # Unite parts of a plane that holes separate, or that got two neighbouring directions.
-        regions, pairs = unite_regions(regions, view, config.plane_smoothness)
-        fits = Fits.of(regions, view.image, errors, view.blocks)
+        sums = sum_regions(regions, view.image, view.blocks, errors)
+        regions, pairs, sums = unite_regions(regions, sums, view, config.plane_smoothness)
+        fits = Fits.of(sums, errors, image.camera is None)
+        probable = Task(plane_probabilities, fits, pairs, config.plane_prior)
         pixels: Task[Labels] | None = None
         if isinstance(labelling, by_planes.Labelling) and side > 1:
             given = regions, labelling.labels, labelling.models, image, side, sensor
             pixels = Task(
                 with_sharp_borders, *given, config.plane_smoothness * sensor.pixel_inflation
             )
-        probability = plane_probabilities(fits, pairs, config.plane_prior)
+        roots, probability = fits.roots(), probable.result()
         # Method normals drops no region.
         flat = (probability >= config.plane_probability) | (config.method == 'normals')
         flat[0] = True
         numbers = numbers_of(flat)
         curved = None if config.method == 'normals' else relabel(regions, numbers_of(~flat))
-        fits, roots = fits.without(~flat), fits.roots()[flat]
+        fits, roots = fits.without(~flat), roots[flat]
         watch.lap('regions')
         # No labels on bridged pixels, nor on regions without a plane or with one up to infinity.
         names = (fits.farthest() > 0)[numbers] * numbers

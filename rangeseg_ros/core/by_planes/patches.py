@@ -206,7 +206,7 @@ def _quads(
     """
     rows, columns = smooth.shape
     parent = make_sets(rows * columns)
-    theta, total = np.zeros(3), np.zeros(SIZE)
+    theta, total = np.zeros((1, 3)), np.zeros((1, SIZE))
     whole, side, found = smooth, 1, True
     while found:
         merged, found = np.zeros((rows, columns), np.bool_), False
@@ -223,15 +223,15 @@ def _quads(
                 if not linked:
                     continue
                 for entry in range(SIZE):
-                    total[entry] = moments[a, entry] + moments[b, entry]
-                    total[entry] += moments[c, entry] + moments[d, entry]
-                together = fit(total, theta)
+                    total[0, entry] = moments[a, entry] + moments[b, entry]
+                    total[0, entry] += moments[c, entry] + moments[d, entry]
+                together = fit(total, 0, theta)
                 apart = residual[a] + residual[b] + residual[c] + residual[d]
-                if total[COUNT] <= largest and together - apart < _CLEAR:
+                if total[0, COUNT] <= largest and together - apart < _CLEAR:
                     merged[i, j] = found = True
                     residual[a] = together
                     for entry in range(SIZE):
-                        moments[a, entry] = total[entry]
+                        moments[a, entry] = total[0, entry]
                     # What has been merged before follows its own parent.
                     parent[b] = parent[c] = parent[d] = a
         whole, side = merged, 2 * side

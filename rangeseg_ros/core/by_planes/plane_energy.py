@@ -6,17 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from rangeseg_ros.core.arrays import Floats, Ints, Singles
 from rangeseg_ros.core.by_planes.shifts import Shifts, shift_at
 from rangeseg_ros.core.graphcut.expansion import link_costs
-from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import NODE
 from rangeseg_ros.core.sensing.grid import Grid
-from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, SLOPE, add_pixel, fit_all
+from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SLOPE, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
+from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 
 NO_PLANE = chi2_quantile(1) / 2
@@ -117,34 +115,3 @@ def costs(labels: Ints, problem: Problem, models: Models) -> Singles:
         if problem.weight[p] > 0:
             cost[p] = data_cost(int(np.intp(labels[p])), p, problem, models)
     return cost
-
-
-def region_moments(
-    labels: NDArray[np.integer], count: int, image: RangeImage, sensor: SensorModel
-) -> Floats:
-    """Moments (count, 13) of the pixels of each of `count` labels (H, W); zeros for label 0."""
-    given = labels, count, image.inverse, image.rays, sensor
-    upper, lower = map_halves(_sum_moments, len(labels), *given)
-    return upper + lower
-
-
-@njit(cache=True, nogil=True)
-def _sum_moments(
-    first: int,
-    after: int,
-    labels: NDArray[np.integer],
-    count: int,
-    inverse: Singles,
-    rays: Singles,
-    sensor: SensorModel,
-) -> Floats:
-    """Those of rows first...after of pixels."""
-    total = np.zeros((count, SIZE))
-    for i in range(first, after):
-        weight = _weights(inverse[i], sensor)
-        for j in range(labels.shape[1]):
-            label, y, w = labels[i, j], np.float64(inverse[i, j]), np.float64(weight[j])
-            if label > 0:
-                ratio = w * systematic_variance(sensor, y * y)
-                add_pixel(total[label], rays[i, j], y, w, ratio)
-    return total

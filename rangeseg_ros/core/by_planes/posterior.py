@@ -24,7 +24,7 @@ from rangeseg_ros.core.fitting.region_sums import (
     RegionSums,
     fit_sums,
 )
-from rangeseg_ros.core.sensing.moments import COUNT, cofactors, squares_left
+from rangeseg_ros.core.sensing.moments import COUNT, cofactors, squares_left, sums_of
 from rangeseg_ros.core.sensing.sensor import (
     SensorModel,
     distortion_share,
@@ -131,17 +131,19 @@ def _residuals(
     """
     system = np.zeros((7, 6))
     size = square = scale = ratio = 0.0
+    plane = theta[0], theta[1], theta[2]
     slope = np.sqrt(theta[0] ** 2 + theta[1] ** 2 + theta[2] ** 2)
     for part in range(1 if a == b else 2):
         k = (a, b)[part]
-        for cell in sums.cells[sums.start[k] : sums.start[k + 1]]:
+        for i in range(sums.start[k], sums.start[k + 1]):
+            cell, left = sums.cells[i], squares_left(sums_of(sums.cells, i), plane)
             count = cell[COUNT]
             mean, level, variance = _mean(cell, theta, sensor)
             _add_terms(system, _terms(cell, sums.box[a]), mean, count)
             size += count
             # Weights of a cloud are not those of its errors.
             unit = count / (variance * cell[WEIGHT])
-            square += max(squares_left(cell, theta), 0.0) * unit
+            square += max(left, 0.0) * unit
             # An error of the inverse leaves the plane by distance / inverse times as much.
             scale += count * np.sqrt(variance) / (slope * abs(level))
             ratio += count * systematic_variance(sensor, level**2) / variance

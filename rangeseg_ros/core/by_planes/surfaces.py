@@ -15,7 +15,6 @@ from numba import njit
 
 from rangeseg_ros.core.arrays import Floats, Indices, Ints, Labels, Mask
 from rangeseg_ros.core.by_planes.patches import Nodes
-from rangeseg_ros.core.by_planes.plane_energy import region_moments
 from rangeseg_ros.core.by_planes.posterior import PLANE_BEND
 from rangeseg_ros.core.by_planes.region_graph import (
     absorb,
@@ -24,6 +23,7 @@ from rangeseg_ros.core.by_planes.region_graph import (
     make_sets,
     renumbered,
 )
+from rangeseg_ros.core.fitting.region_sums import RegionSums
 from rangeseg_ros.core.regions import by_falling_size, relabel
 from rangeseg_ros.core.sensing.blocks import NODE
 from rangeseg_ros.core.sensing.grid import View
@@ -80,18 +80,19 @@ def join_surfaces(
     return surface[patches], moments
 
 
-def unite_regions(regions: Labels, view: View, smoothness: float) -> tuple[Labels, Labels]:
+def unite_regions(
+    regions: Labels, sums: RegionSums, view: View, smoothness: float
+) -> tuple[Labels, Labels, RegionSums]:
     """Unite regions (H, W) whose pixels touch, for the reasons for which patches are.
 
     Where holes or jumps leave no blocks beside each other, their pixels may still touch. Also
-    returns the pairs (E, 2) of regions that touch.
+    returns the pairs (E, 2) of regions that touch, and the sums over the united ones.
     """
-    moments = region_moments(regions, int(regions.max(initial=0)) + 1, view.whole, view.sensor)
-    expected = Expected.of(view, 1, smoothness)
+    moments, expected = sums.moments(view.sensor), Expected.of(view, 1, smoothness)
     roots, pairs = _agglomerate(regions.astype(np.int32), *view.grid, moments, expected)
-    pixels = np.bincount(roots, moments[:, COUNT], len(moments)).astype(np.intp)
+    pixels = np.bincount(roots, sums.pixels, len(roots)).astype(np.intp)
     numbers = by_falling_size(pixels)[roots]
-    return relabel(regions, numbers), numbers[pairs]
+    return relabel(regions, numbers), numbers[pairs], sums.united(numbers)
 
 
 @njit(cache=True, nogil=True)

@@ -6,12 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rangeseg_ros.core.arrays import Floats, Labels, Mask
-from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER, RegionSums, fit_sums, sum_regions
+from rangeseg_ros.core.arrays import Floats, Mask
+from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER, RegionSums, fit_sums
 from rangeseg_ros.core.fitting.uncertainty import covariance_roots, levels
-from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.moments import COUNT, SYMMETRIC, cofactors
-from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # Sine of the angle at which no surface is seen any more.
@@ -32,21 +30,15 @@ class Fits(NamedTuple):
     level: Floats
 
     @classmethod
-    def of(
-        cls, labels: Labels, image: RangeImage, sensor: SensorModel, blocks: Blocks | None = None
-    ) -> Fits:
+    def of(cls, sums: RegionSums, sensor: SensorModel, cloud: bool) -> Fits:
         """Fit a plane to every region.
 
-        Regions are labels (H, W) 0...M, 0 for no plane. Weighted least squares in inverse range,
-        where a plane is linear and the error of a camera lies. An organised cloud tells neither
-        its sensor's centre nor the direction of its errors; there the plane is that of total least
-        squares of the points. Either leaves out what is beyond four standard deviations of the
-        sensor's errors, see `sum_regions`.
+        By weighted least squares in inverse range, where a plane is linear and the error of a
+        camera lies. An organised `cloud` tells neither its sensor's centre nor the direction of
+        its errors; there the plane is that of total least squares of the points.
         """
-        sums, total = sum_regions(labels, image, blocks or Blocks.of(image), sensor)
-        theta = fit_sums(total)
-        if image.camera is None:
-            theta = _total_least_squares(total, theta)
+        total = sums.total()
+        theta = _total_least_squares(total, fit_sums(total)) if cloud else fit_sums(total)
         return cls(sums, total, theta, sensor, levels(sums, theta))
 
     def without(self, dropped: Mask) -> Fits:

@@ -7,7 +7,7 @@ errors, couples pairs of cells by the mean and the variance of their pixels' pos
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -20,11 +20,14 @@ from rangeseg_ros.core.sensing.moments import (
     CHI2,
     COUNT,
     NO_PIXEL,
+    RATIO,
+    SIZE,
     fit_all,
     plus_pixel,
     ray_of,
     squares_left,
     sum_by_label,
+    sums_of,
 )
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
@@ -41,22 +44,9 @@ class Layout(NamedTuple):
     """Cells of regions 0...M; region 0 has none."""
 
     box: Indices  # (M + 1, 4), first row and column, those after the last; or zeros
-    side: Indices  # (M + 1,), blocks along the side of a cell
+    scale: Floats  # (M + 1,), cells per block along their side
     columns: Indices  # (M + 1,), cells side by side
     start: Indices  # (M + 2,), where each region's cells begin
-
-    @classmethod
-    def of(cls, labels: Labels) -> Layout:
-        """Cells of whole blocks for the regions of labels (H, W), as small as may be."""
-        box = find_boxes(labels, int(labels.max(initial=0)) + 1)
-        first, after = box[:, :2], box[:, 2:]
-        rows, across = (-(-after // BLOCK) - first // BLOCK).T
-        side = np.maximum(np.sqrt(rows * across / MAX_CELLS).astype(np.intp), 1)
-        while (many := -(-rows // side) * -(-across // side) > MAX_CELLS).any():
-            side += many
-        columns = -(-across // side)
-        start = np.concatenate([[0], np.cumsum(-(-rows // side) * columns)])
-        return cls(box, side, columns, start)
 
 
 class RegionSums(NamedTuple):
@@ -80,36 +70,64 @@ class RegionSums(NamedTuple):
         cells = self.cells[np.repeat(kept, length)]
         return RegionSums(self.box[kept], start, cells, self.pixels[kept], self.outliers[kept])
 
+    def united(self, number: Labels) -> RegionSums:
+        """Those of unions of regions that get the same new `number` (M + 1,), 0 for none."""
+        counts = (np.bincount(number, n).astype(np.intp) for n in (self.pixels, self.outliers))
+        return RegionSums._of_cells(*_united(number, self), *counts)
+
+    @classmethod
+    def _of_cells(
+        cls, layout: Layout, cells: Floats, pixels: Indices, outliers: Indices
+    ) -> RegionSums:
+        """Those of all cells of a layout, of which those with pixels are kept."""
+        kept = cells[:, COUNT] > 0
+        start = np.searchsorted(np.flatnonzero(kept), layout.start)
+        return cls(layout.box, start, cells[kept], pixels, outliers)
+
+    def total(self) -> Floats:
+        """Sums (M + 1, 29) over the cells of each region."""
+        return sum_by_label(self.owners, self.cells, len(self.box))
+
+    def moments(self, sensor: SensorModel) -> Floats:
+        """Moment vectors (M + 1, 13) of regions, with weights of a sensor."""
+        cells = self.cells
+        squared = (cells[:, INVERSE] / cells[:, WEIGHT]) ** 2
+        variance = random_variance(sensor, squared)
+        moments = np.zeros((len(cells), SIZE))
+        # Weights of a cloud are not those of its errors.
+        unit = cells[:, COUNT] / (variance * cells[:, WEIGHT])
+        moments[:, : CHI2 + 1] = cells[:, : CHI2 + 1] * unit[:, None]
+        moments[:, COUNT] = cells[:, COUNT]
+        moments[:, RATIO] = cells[:, COUNT] * systematic_variance(sensor, squared) / variance
+        return sum_by_label(self.owners, moments, len(self.box))
+
 
 def sum_regions(
     labels: Labels, image: RangeImage, blocks: Blocks, sensor: SensorModel
-) -> tuple[RegionSums, Floats]:
+) -> RegionSums:
     """Sums over the pixels of regions (H, W), but for outliers from their least-squares planes.
 
     Outliers are beyond four standard deviations of the sensor's errors from the plane of the
     blocks (of 4 x 4 pixels) that the region fills. It keeps them where they are more than half of
-    it: then the sensor model does not fit, or there is no plane. Also returns the sums (M + 1, 29)
-    over the cells of each region.
+    it: then the sensor model does not fit, or there is no plane.
     """
-    layout = Layout.of(labels)
+    layout = _layout(find_boxes(labels, int(labels.max(initial=0)) + 1))
     inside = _labels_of_blocks(labels)
     axis = image.camera.axes[:, 2].copy() if image.camera is not None else np.zeros(3)
     pixels = labels, inside, image.inverse, image.rays, image.pinhole, image.camera is not None
     moments = blocks.moments.reshape(inside.size, -1)
     planes = fit_sums(sum_by_label(inside.ravel(), moments, len(layout.box)))
     halves = map_halves(_accumulate, len(inside), *pixels, axis, blocks, sensor, layout, planes)
-    cells, outside = np.add(*halves)
+    cells, outside = np.add(*halves).reshape(2, -1, RECORD)
     owners, count = regions_of(layout.start), len(layout.box)
-    total, left_out = (sum_by_label(owners, part, count) for part in (cells, outside))
-    outliers = left_out[:, COUNT].astype(np.intp)
-    measured = total[:, COUNT].astype(np.intp) + outliers
+    inliers, outliers = (
+        np.bincount(owners, part[:, COUNT], count).astype(np.intp) for part in (cells, outside)
+    )
+    measured = inliers + outliers
     many = 2 * outliers > measured
     if many.any():
         cells += outside * many[owners, None]
-        total += left_out * many[:, None]
-    kept = cells[:, COUNT] > 0
-    start = np.searchsorted(np.flatnonzero(kept), layout.start)
-    return RegionSums(layout.box, start, cells[kept], measured, outliers), total
+    return RegionSums._of_cells(layout, cells, measured, outliers)
 
 
 def fit_sums(total: Floats) -> Floats:
@@ -144,6 +162,45 @@ def find_boxes(labels: NDArray[np.integer], count: int) -> Indices:
 
 
 @njit(cache=True, nogil=True)
+def _layout(box: Indices) -> Layout:
+    """Cells of whole blocks in bounding boxes (M + 1, 4), as small as may be."""
+    start = np.zeros(len(box) + 1, np.intp)
+    scale, columns = np.empty(len(box)), np.empty(len(box), np.intp)
+    for k in range(len(box)):
+        rows = -(-box[k, 2] // BLOCK) - box[k, 0] // BLOCK
+        across = -(-box[k, 3] // BLOCK) - box[k, 1] // BLOCK
+        side = 1
+        while -(-rows // side) * -(-across // side) > MAX_CELLS:
+            side += 1
+        scale[k], columns[k] = 1 / side, -(-across // side)
+        start[k + 1] = start[k] - (-rows // side) * columns[k]
+    return Layout(box, scale, columns, start)
+
+
+@njit(cache=True, nogil=True)
+def _united(number: Labels, sums: RegionSums) -> tuple[Layout, Floats]:
+    """Cells of regions by another number, 0 for none, and the sums (N, 29) over these."""
+    box = np.zeros((int(number.max()) + 1, 4), np.intp)
+    known = np.flatnonzero(number)
+    for k in known:
+        own, whole = sums.box[k], box[number[k]]
+        first = whole[2] == 0
+        for side in range(2):
+            whole[side] = own[side] if first else min(whole[side], own[side])
+            whole[2 + side] = max(whole[2 + side], own[2 + side])
+    layout = _layout(box)
+    cells = np.zeros((layout.start[-1], RECORD))
+    for k in known:
+        for i in range(sums.start[k], sums.start[k + 1]):
+            cell = sums.cells[i]
+            row, column = cell[PLACE] / cell[COUNT], cell[PLACE + 1] / cell[COUNT]
+            c = _cell_of(layout, number[k], int(row) // BLOCK, int(column) // BLOCK)
+            for entry in range(RECORD):
+                cells[c, entry] += cell[entry]
+    return layout, cells
+
+
+@njit(cache=True, nogil=True)
 def _labels_of_blocks(labels: Labels) -> Ints:
     """Labels (rows, columns) of all pixels of each block; -1 where they have several."""
     height, width = labels.shape
@@ -162,8 +219,10 @@ def _labels_of_blocks(labels: Labels) -> Ints:
 @njit(cache=True, inline='always')
 def _cell_of(layout: Layout, label: int, bi: int, bj: int) -> int:
     """Cell of a region's pixels in a block: cells consist of whole blocks."""
-    row = (bi - layout.box[label, 0] // BLOCK) // layout.side[label]
-    column = (bj - layout.box[label, 1] // BLOCK) // layout.side[label]
+    # By the middle of the block, which no rounding takes to the next cell. Not divided by the
+    # side: of integers that takes most of the time of a block.
+    row = int((bi + 0.5 - layout.box[label, 0] // BLOCK) * layout.scale[label])
+    column = int((bj + 0.5 - layout.box[label, 1] // BLOCK) * layout.scale[label])
     return layout.start[label] + row * layout.columns[label] + column
 
 
@@ -183,28 +242,29 @@ def _accumulate(
     layout: Layout,
     theta: Floats,
 ) -> Floats:
-    """Sums (2, N, 29) over rows first...after of blocks: of inliers of `theta`, of outliers.
+    """Sums (2 N, 29) over rows first...after of blocks: of inliers of `theta`, then of outliers.
 
     Of regions whose plane (M + 1, 3) is zero there are no outliers.
     """
-    height, width = labels.shape
-    cells = np.zeros((2, layout.start[-1], RECORD))
+    (height, width), columns, count = labels.shape, inside.shape[1], layout.start[-1]
+    cells, moments = np.zeros((2 * count, RECORD)), blocks.moments.reshape(-1, SIZE)
     for bi in range(first, after):
         bottom = min((bi + 1) * BLOCK, height)
-        for bj in range(inside.shape[1]):
+        for bj in range(columns):
             right, squared = min((bj + 1) * BLOCK, width), blocks.squared[bi, bj]
-            label = int(inside[bi, bj])
+            label, k = int(inside[bi, bj]), bi * columns + bj
             if squared == 0 or label == 0:
                 continue
             # Rays of a cloud are not of one length along any axis: their sums are not known.
             if central and label > 0:
-                plane, moments = theta[label], blocks.moments[bi, bj]
+                a, b, c = theta[label, 0], theta[label, 1], theta[label, 2]
                 limit = random_variance(sensor, squared) + systematic_variance(sensor, squared)
-                limit *= OUTLIER**2 * moments[COUNT]
-                if not plane.any() or squares_left(moments, plane) <= limit:
-                    record = cells[0, _cell_of(layout, label, bi, bj)]
+                limit *= OUTLIER**2 * moments[k, COUNT]
+                fitted = a != 0 or b != 0 or c != 0
+                if not fitted or squares_left(sums_of(moments, k), (a, b, c)) <= limit:
+                    cell = _cell_of(layout, label, bi, bj)
                     middle = (bi * BLOCK + bottom - 1) / 2, (bj * BLOCK + right - 1) / 2
-                    _add_block(record, moments, squared, sensor, axis, middle)
+                    _add_block(cells, cell, moments, k, squared, sensor, axis, middle)
                     continue
             for i in range(bi * BLOCK, bottom):
                 for j in range(bj * BLOCK, right):
@@ -221,56 +281,61 @@ def _accumulate(
                     # Seen from one centre, the error is in the inverse range. Otherwise its
                     # direction is unknown, and weights are those of distances from the plane.
                     weight = 1 / (variance if central else squared)
-                    record = cells[1 if far else 0, _cell_of(layout, label, bi, bj)]
-                    _add_pixel(record, float(i), float(j), ray, y, weight)
+                    cell = _cell_of(layout, label, bi, bj) + count * far
+                    _add_pixel(cells, cell, float(i), float(j), ray, y, weight)
     return cells
 
 
 @njit(cache=True, inline='always')
 def _add_pixel(
-    record: Floats, i: float, j: float, ray: tuple[float, float, float], y: float, weight: float
+    cells: Floats, k: int, i: float, j: float, ray: tuple[Any, ...], y: float, weight: float
 ) -> None:
-    """Add a pixel to a cell."""
-    x0, x1, x2 = float(ray[0]), float(ray[1]), float(ray[2])
+    """Add a pixel to one of the cells (N, 29)."""
+    x0, x1, x2, far = float(ray[0]), float(ray[1]), float(ray[2]), 1 / y
     for entry, value in enumerate(plus_pixel(NO_PIXEL, x0, x1, x2, y, weight)):
-        record[entry] += value
+        cells[k, entry] += value
     ones = 1.0, weight * x0, weight * x1, weight * x2, weight * y, weight
     for entry, value in enumerate(ones):
-        record[COUNT + entry] += value
-    points = plus_pixel(NO_PIXEL, x0 / y, x1 / y, x2 / y, 1.0, 1.0)
+        cells[k, COUNT + entry] += value
+    points = plus_pixel(NO_PIXEL, x0 * far, x1 * far, x2 * far, 1.0, 1.0)
     for entry in range(6):
-        record[SCATTER + entry] += points[entry]
+        cells[k, SCATTER + entry] += points[entry]
     for entry in range(3):
-        record[POINT + entry] += points[6 + entry]
+        cells[k, POINT + entry] += points[6 + entry]
     for entry, value in enumerate((i, j, i * i, j * j)):
-        record[PLACE + entry] += value
+        cells[k, PLACE + entry] += value
 
 
 @njit(cache=True, inline='always')
 def _add_block(
-    record: Floats,
+    cells: Floats,
+    k: int,
     moments: Floats,
+    m: int,
     squared: float,
     sensor: SensorModel,
     axis: Floats,
     middle: tuple[float, float],
 ) -> None:
-    """Add a block, of moments with unit weights, to a cell: rays are 1 long along `axis`."""
-    weight, count = 1 / random_variance(sensor, squared), moments[COUNT]
+    """Add one of the blocks, of moments (B, 13) with unit weights, to one of the cells (N, 29).
+
+    Rays are 1 long along `axis`.
+    """
+    weight, count, far = 1 / random_variance(sensor, squared), moments[m, COUNT], 1 / squared
     for entry in range(CHI2 + 1):
-        record[entry] += weight * moments[entry]
-    record[COUNT] += count
+        cells[k, entry] += weight * moments[m, entry]
+    cells[k, COUNT] += count
     # The sum of r r^T f is that of r where r^T f is 1.
     for entry, (a, b, c) in enumerate(((0, 1, 2), (1, 3, 4), (2, 4, 5), (6, 7, 8))):
-        along = axis[0] * moments[a] + axis[1] * moments[b] + axis[2] * moments[c]
-        record[RAY + entry] += weight * along
-    record[WEIGHT] += weight * count
+        along = axis[0] * moments[m, a] + axis[1] * moments[m, b] + axis[2] * moments[m, c]
+        cells[k, RAY + entry] += weight * along
+    cells[k, WEIGHT] += weight * count
     # With 1 / y^2 for weights, sums of r y and r r^T are those of points and of their squares.
     for entry in range(3):
-        record[POINT + entry] += moments[6 + entry] / squared
+        cells[k, POINT + entry] += far * moments[m, 6 + entry]
     for entry in range(6):
-        record[SCATTER + entry] += moments[entry] / squared
+        cells[k, SCATTER + entry] += far * moments[m, entry]
     spread = (BLOCK**2 - 1) / 12
     for entry in range(2):
-        record[PLACE + entry] += count * middle[entry]
-        record[PLACE + 2 + entry] += count * (middle[entry] ** 2 + spread)
+        cells[k, PLACE + entry] += count * middle[entry]
+        cells[k, PLACE + 2 + entry] += count * (middle[entry] ** 2 + spread)

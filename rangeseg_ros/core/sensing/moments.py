@@ -71,42 +71,30 @@ def plus_pixel(
 
 
 @njit(cache=True, inline='always')
-def add_pixel(
-    moments: Floats,
-    ray: Singles | tuple[Any, Any, Any],
-    inverse: float,
-    weight: float,
-    ratio: float,
-) -> None:
-    """Add a pixel to a moment vector (13,).
-
-    `weight` is 1 / random variance, `ratio` the systematic over the random variance.
-    """
-    x, y, z = np.float64(ray[0]), np.float64(ray[1]), np.float64(ray[2])
-    for entry, value in enumerate(plus_pixel(NO_PIXEL, x, y, z, inverse, weight)):
-        moments[entry] += value
-    moments[COUNT] += 1
-    moments[RATIO] += ratio
-
-
-@njit(cache=True, inline='always')
 def plane_of(sums: tuple[float, ...]) -> tuple[float, float, float, float]:
     """Least-squares plane of the first ten sums of a moment vector, and the squares it leaves.
 
     Zeros and all squares where the pixels do not determine one. For kernels of the error model
     'numpy': without branches, so that the compiler takes many at a time.
     """
-    a, b, c, d, e, f, p, q, r, square = sums
+    a, b, c, d, e, f, p, q, r, _ = sums
     aa, bb, cc, dd, ee, ff, determinant = cofactors(a, b, c, d, e, f)
     scale = 1 / determinant if determinant > 1e-13 * a * d * f else 0.0
     x = scale * (aa * p + bb * q + cc * r)
     y = scale * (bb * p + dd * q + ee * r)
     z = scale * (cc * p + ee * q + ff * r)
+    left = squares_left(sums, (x, y, z))
+    return x, y, z, left if left > 0 else 0.0
+
+
+@njit(cache=True, inline='always')
+def squares_left(sums: tuple[float, ...], theta: tuple[float, float, float]) -> float:
+    """Sum of the squared residuals that a plane leaves, of the first ten sums of a vector."""
+    (a, b, c, d, e, f, p, q, r, square), (x, y, z) = sums, theta
     # Not square - x p - y q - z r: where pixels lie in nearly one direction, theta is inaccurate,
     # and its error enters there linearly, here squared.
     left = square - 2 * (x * p + y * q + z * r)
-    left += x * (a * x + 2 * (b * y + c * z)) + y * (d * y + 2 * e * z) + f * z * z
-    return x, y, z, left if left > 0 else 0.0
+    return left + (x * (a * x + 2 * (b * y + c * z)) + y * (d * y + 2 * e * z) + f * z * z)
 
 
 @njit(cache=True, inline='always')
@@ -127,19 +115,10 @@ def sums_of(moments: Floats, k: int) -> tuple[float, ...]:
 
 
 @njit(cache=True, error_model='numpy')
-def fit(moments: Floats, theta: Floats) -> float:
-    """Write the plane of moments (13,), or zeros, to theta (3,); sum of the squared residuals."""
-    theta[0], theta[1], theta[2], left = plane_of(sums_of(moments.reshape(1, -1), 0))
+def fit(moments: Floats, k: int, theta: Floats) -> float:
+    """Write the plane of one of N moment vectors, or zeros, to theta (N, 3); squares it leaves."""
+    theta[k, 0], theta[k, 1], theta[k, 2], left = plane_of(sums_of(moments, k))
     return left
-
-
-@njit(cache=True)
-def squares_left(moments: Floats, theta: Floats) -> float:
-    """Weighted sum of the squared residuals that a plane theta (3,) leaves of moments (13,)."""
-    a, b, c = theta[0], theta[1], theta[2]
-    square = a * (a * moments[0] + 2 * (b * moments[1] + c * moments[2]))
-    square += b * (b * moments[3] + 2 * c * moments[4]) + c * c * moments[5]
-    return moments[CHI2] - 2 * (a * moments[6] + b * moments[7] + c * moments[8]) + square
 
 
 @njit(cache=True, error_model='numpy')
@@ -169,7 +148,7 @@ def fit_all(moments: Floats) -> tuple[Floats, Floats]:
     theta = np.zeros((len(moments), 3))
     residual = np.zeros(len(moments))
     for i in range(len(moments)):
-        residual[i] = fit(moments[i], theta[i])
+        residual[i] = fit(moments, i, theta)
     return theta, residual
 
 
