@@ -25,7 +25,7 @@ def grid(height, width, seed=0):
 def nodes_of(inverse, rays, edges, **sensor):
     """Blocks of 2 x 2 pixels that surfaces are grown from."""
     image, model = RangeImage(rays, inverse), SensorModel.from_config(Config(**sensor))
-    return Nodes.of(View(image, image, Blocks.of(image), edges, model, 1, 0.0, True))
+    return Nodes.of(View(image, image, edges, model, 1, 0.0, True))
 
 
 @pytest.mark.parametrize('hole', [(2, 2), (3, 2), (2, 3), np.s_[4], np.s_[:4, 4]])

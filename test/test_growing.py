@@ -7,7 +7,6 @@ from rangeseg_ros import Camera, Config, RangeImage
 from rangeseg_ros.core.by_planes.patches import Nodes, find_patches
 from rangeseg_ros.core.by_planes.region_graph import absorb, find_contacts
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces
-from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.grid import View, grid_of
 from rangeseg_ros.core.sensing.jump_edges import plane_deviation
 from rangeseg_ros.core.sensing.moments import fit_all
@@ -32,7 +31,7 @@ def grown(inverse, noise=NOISE, seed=0, least=1, **sensor):
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
     edges = grid_of(image, plane_deviation(image, 0.0065))
     model = SensorModel.from_config(Config(pixel_noise=0.0, **sensor))
-    view = View(image, image, Blocks.of(image), edges, model, least, image.pixel_area, True)
+    view = View(image, image, edges, model, least, image.pixel_area, True)
     nodes = Nodes.of(view)
     return join_surfaces(*find_patches(nodes, model), nodes, view, SMOOTHNESS)
 

@@ -14,7 +14,6 @@ from rangeseg_ros.core.by_planes.shifts import Shifts, shift_at
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.graphcut.expansion import GridLabelling, energy, fronts, minimise
 from rangeseg_ros.core.regions import connected_components
-from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.grid import Grid, View, grid_of
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.simulation.render import simulate
@@ -173,7 +172,7 @@ def test_the_energy_is_nearly_that_of_expansions_to_all_pixels():
     image = RangeImage.from_depth(frame.depth, frame.camera)
     sensor = SensorModel.from_config(Config(pixel_noise=0.0))
     edges = grid_of(image)
-    view = View(image, image, Blocks.of(image), edges, sensor, 1, image.pixel_area, True)
+    view = View(image, image, edges, sensor, 1, image.pixel_area, True)
     nodes = Nodes.of(view)
     surface, moments = join_surfaces(*find_patches(nodes, sensor), nodes, view, LAMBDA)
     problem = Problem.of(image, sensor, edges, LAMBDA)

@@ -131,7 +131,7 @@ class Segmenter:
         if config.dithering > 0:
             image, begun = image.dithered(config.dithering, config.seed), None
         begun = begun or Task(_binned, image, side)
-        view, sensor, jumps = _preprocessed(image, config, begun, watch)
+        view, sensor, jumps, blocks = _preprocessed(image, config, begun, watch)
         labelling: by_planes.Labelling | by_normals.Labelling
         if config.method == 'planes':
             labelling = by_planes.segment(view, config, watch.lap)
@@ -142,7 +142,7 @@ class Segmenter:
             valid, errors = view.whole.valid, SensorModel.from_config(config, image.shape)
         regions = plane_regions(labelling.labels, valid, view.grid, view.min_pixels)
         # Unite parts of a plane that holes separate, or that got two neighbouring directions.
-        sums = sum_regions(regions, view.image, view.blocks, errors)
+        sums = sum_regions(regions, view.image, blocks.result(), errors)
         regions, pairs, sums = unite_regions(regions, sums, view, config.plane_smoothness)
         fits = Fits.of(sums, errors, image.camera is None)
         probable = Task(plane_probabilities, fits, pairs, config.plane_prior)
@@ -195,10 +195,10 @@ def _binned(image: RangeImage, side: int) -> tuple[Bins, list[Blocks]]:
 
 def _preprocessed(
     image: RangeImage, config: Config, begun: BinsTask, watch: Stopwatch
-) -> tuple[View, SensorModel, GridEdges | None]:
+) -> tuple[View, SensorModel, GridEdges | None, Task[Blocks]]:
     """What is known of an image's bins before planes are looked for.
 
-    And the errors of its pixels, and the jump edges between bins.
+    And the errors of its pixels, the jump edges between bins, and blocks of 4 x 4 bins.
     """
     measured, planes = config.sensor_model == 'measured', config.method == 'planes'
     quanta = quantisation(image.inverse) if measured else None
@@ -219,18 +219,17 @@ def _preprocessed(
     excess = bins.noise_of_pixels(sensor)
     if side > 1:
         image = bins.of_one_surface(steps.pixels * np.float32(excess**0.5))
-    blocks = Task(scales[0].updated, bins.means, image)
     # Planes are fitted to what was measured; where they end is found with small holes bridged,
     # which bins of several pixels do not have.
     whole = bridge_holes(image, steps.windows, steps.slopes) if side == 1 else image
     if nodes:
         nodes = Task(nodes.result().updated, bins.means, whole, NODE)
     jumps = jump_edges(whole, config.jump_edges, steps.windows, steps.slopes, steps.pixels)
+    blocks = Task(scales[0].updated, bins.means, image)
     grid = grid_of(whole, jumps)
     watch.lap('edges')
-    known = blocks.result(), grid, sensor, least, bins.area, identified
-    view = View(image, whole, *known, nodes.result() if nodes else None)
-    return view, sensor.of_pixels(side, excess), jumps
+    known = grid, sensor, least, bins.area, identified, nodes.result() if nodes else None
+    return View(image, whole, *known), sensor.of_pixels(side, excess), jumps, blocks
 
 
 def _reason(image: RangeImage, planes: list[Plane]) -> str:

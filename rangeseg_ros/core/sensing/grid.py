@@ -29,15 +29,14 @@ class Grid(NamedTuple):
 class View(NamedTuple):
     """A range image, or its bins, and what is known of it before planes are looked for.
 
-    In `whole` small holes of `image` are bridged; `grid` is of `whole`. `blocks` are 4 x 4 pixels
-    of `image`; `nodes`, 2 x 2 of `whole`, are None or overwritten by `Nodes.of`. `min_pixels` is
-    the size of the smallest plane, and `area` that of a pixel at inverse range 1, m^2.
-    `identified` is False where `sensor` was to be measured and the image shows too little.
+    In `whole` small holes of `image` are bridged; `grid` is of `whole`. `nodes`, blocks of 2 x 2
+    pixels of `whole`, are None or overwritten by `Nodes.of`. `min_pixels` is the size of the
+    smallest plane, and `area` that of a pixel at inverse range 1, m^2. `identified` is False where
+    `sensor` was to be measured and the image shows too little.
     """
 
     image: RangeImage
     whole: RangeImage
-    blocks: Blocks
     grid: Grid
     sensor: SensorModel
     min_pixels: int
