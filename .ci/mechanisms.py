@@ -161,12 +161,12 @@ MECHANISMS = (
                side, *rest: regions.repeat(side, 0).repeat(side, 1)[
                    : image.shape[0], : image.shape[1]] * image.valid}),
     Mechanism('curved regions told', 'by_planes/posterior.py', {'plane_probability': 0.0}),
-    Mechanism('small blocks tell the bends of planes', 'by_planes/posterior.py:_probability',
-              {'segmenter.plane_probabilities':
+    Mechanism('small blocks tell the bends of planes', 'by_planes/posterior.py:_posterior',
+              {'segmenter.plane_posteriors':
                lambda original: lambda fits, *rest: original(
                    fits._replace(sensor=fits.sensor._replace(unbent=1.0)), *rest)}),
     Mechanism('facets of curved surfaces told', 'by_planes/posterior.py:_evidence,_solution',
-              {'segmenter.plane_probabilities': _given(1, np.zeros((0, 2), np.uint16))}),
+              {'segmenter.plane_posteriors': _given(1, np.zeros((0, 2), np.uint16))}),
     Mechanism('method normals', ' '.join(f'by_normals/{name}.py' for name in _NORMALS),
               {'method': 'normals'}, option=True),
     # Planes.

@@ -8,7 +8,6 @@ from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.by_planes.borders import with_sharp_borders
 from rangeseg_ros.core.by_planes.plane_energy import CAP, NO_PLANE, Models
 from rangeseg_ros.core.by_planes.shifts import Shifts
-from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.sensing.binning import BUDGETS, Bins, bin_side, widening
 from rangeseg_ros.core.sensing.blocks import NODE
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -207,11 +206,6 @@ def test_clouds_and_bodies_are_halved(room):
     body = np.indices(image.shape)[0] >= 150
     hidden = Segmenter(budget).segment(image.without(body))
     assert hidden.planes and not hidden.labels[body].any()
-
-
-def test_budgets_are_for_method_planes():
-    with pytest.raises(ConfigError, match='work_budget'):
-        Config(work_budget=0.95, method='normals')
 
 
 def test_planes_scatter_by_the_noise_of_pixels_and_not_of_bins():

@@ -54,6 +54,7 @@ def test_integers_and_numbers_of_numpy_are_taken():
         ({'exact': 1}, ['exact', 'bool']),
         ({'method': 'magic'}, ['method', 'planes', 'normals']),
         ({'direction_count': 300}, ['direction_count', '305']),
+        ({'work_budget': 0.95, 'method': 'normals'}, ['work_budget']),
     ],
 )
 def test_refusals_name_the_parameter_and_what_it_takes(values, words):

@@ -116,8 +116,7 @@ def test_damaged_files_are_refused(tmp_path_factory, data):
     del content[data.draw(st.integers(0, len(content))) :]
     for _ in range(data.draw(st.integers(0, 3))):
         if content:
-            place = data.draw(st.integers(0, len(content) - 1))
-            content[place] = data.draw(st.integers(0, 255))
+            content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
     path.write_bytes(bytes(content))
     try:
         assert np.isfinite(read_distortion(path).offset).all()

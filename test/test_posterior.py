@@ -6,7 +6,7 @@ from planes_of_labels import fits_of
 from scipy.ndimage import binary_dilation, convolve, find_objects
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
-from rangeseg_ros.core.by_planes.posterior import _evidence, plane_probabilities
+from rangeseg_ros.core.by_planes.posterior import _evidence, calibrated, plane_posteriors
 from rangeseg_ros.core.by_planes.shifts import shift_at, shifts
 from rangeseg_ros.core.fitting.region_sums import INVERSE, PLACE, RAY, WEIGHT
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO
@@ -42,8 +42,7 @@ def fitted(inverse, regions, seed=0, times=1):
 
 
 def probabilities(inverse, regions, seed=0, pairs=NO_PAIRS, times=1):
-    fits = fitted(inverse, regions, seed, times)
-    return plane_probabilities(fits, np.array(pairs, np.uint16), 0.5)
+    return plane_posteriors(fitted(inverse, regions, seed, times), np.array(pairs, np.uint16))
 
 
 def alone_and_beside(inverse, regions, *pairs):
@@ -61,8 +60,15 @@ def test_planes_that_the_sensor_bends_are_planes_and_cylinders_none(seed):
     # Small blocks show a part of the distortion: it is as much, or surfaces bend the large ones.
     fits, half = fitted(inverse, inverse > 0), SENSOR.distortion / 2
     parts = SENSOR, SENSOR._replace(unbent=0.25), SENSOR._replace(distortion=half)
-    found = [plane_probabilities(fits._replace(sensor=s), NO_PAIRS, 0.5)[1] for s in parts]
+    found = [plane_posteriors(fits._replace(sensor=s), NO_PAIRS)[1] for s in parts]
     assert found[2] < found[1] < found[0]
+
+
+def test_evidence_moves_the_calibrated_odds_evenly():
+    found = calibrated(np.array([0, 0.2, 0.5, 0.8, 1]))
+    odds = np.log(found[1:4] / (1 - found[1:4]))
+    assert (found[0], found[4]) == (0, 1) and np.diff(odds) == pytest.approx(2.9 * np.log([4, 4]))
+    assert 0 < found[2] - Config().plane_probability < 0.001
 
 
 @pytest.mark.parametrize('bend', [0.08, 0.15])
@@ -74,7 +80,7 @@ def test_rows_and_columns_are_alike(bend):
 
     def probability(inverse):
         image = RangeImage(camera.rays, inverse.astype(np.float32), camera)
-        return plane_probabilities(fits_of(whole, image, sensor), NO_PAIRS, 0.5)[1]
+        return plane_posteriors(fits_of(whole, image, sensor), NO_PAIRS)[1]
 
     one, other = probability(inverse), probability(inverse.T)
     assert one == pytest.approx(other, rel=1e-6) and 0.2 < one < 0.9

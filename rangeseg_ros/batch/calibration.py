@@ -101,8 +101,7 @@ class SightingsOfPart:
         where = self.source.path
         settings = where.absolute(), self.source, asdict(self.config), self.first, self.after
         recorded = where.iterdir() if where.is_dir() else [where]
-        key = result_key(settings, correction_files(self.config), recorded)
-        path = self.kept / f'{key}.npz'
+        path = self.kept / f'{result_key(settings, correction_files(self.config), recorded)}.npz'
         if path.exists():
             return _read(path)
         segmenter = Segmenter(self.config)

@@ -171,8 +171,7 @@ class _Results:
     def _write(self, index: int, stamp: int, image: RangeImage, result: Segmentation) -> None:
         leading = [str(index), seconds_of(stamp)]
         kinds = PICTURES + TERRAIN if self.replay.terrain else PICTURES
-        stem = f'{index:06d}_{leading[1]}'
-        files = write_frame(self.folder, stem, image, result, kinds)
+        files = write_frame(self.folder, f'{index:06d}_{leading[1]}', image, result, kinds)
         self.add_planes([*leading, *tables.values(plane)] for plane in result.planes)
         self.report.add(stamp, result, files['overlay'])
         if image.valid.any():

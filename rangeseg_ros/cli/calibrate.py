@@ -124,8 +124,7 @@ def _together(seen: list[Seen]) -> tuple[Sightings, tuple[int, int], Any]:
         raise click.UsageError(f'images of several sizes: {text}')
     if len({part.camera for part in seen}) > 1:
         raise click.UsageError('recordings of several cameras')
-    sightings = concatenate([part.sightings for part in seen])
-    return sightings, seen[0].shape, seen[0].camera
+    return concatenate([part.sightings for part in seen]), seen[0].shape, seen[0].camera
 
 
 def _report(result: Calibration) -> None:

@@ -158,10 +158,8 @@ def _room(noise: float, camera: Camera, size: int) -> NDArray[np.uint16]:
     """Depth (H, W), mm: walls and floor, a box and a ball before them, noise, holes."""
     x, y = camera.rays[..., 0], camera.rays[..., 1]
     depth = 2 / (1 + np.abs(x))
-    floor = np.where(y > 0.1, 0.6 / np.maximum(y, 0.1), np.inf)
-    depth = np.minimum(depth, floor)
-    box = np.s_[24 * size : 40 * size, 8 * size : 24 * size]
-    depth[box] = 1.0
+    depth = np.minimum(depth, np.where(y > 0.1, 0.6 / np.maximum(y, 0.1), np.inf))
+    depth[24 * size : 40 * size, 8 * size : 24 * size] = 1.0
     ball = (x - 0.3) ** 2 + (y + 0.15) ** 2 < 0.03
     depth[ball] = 1.2 + 2 * ((x - 0.3) ** 2 + (y + 0.15) ** 2)[ball]
     depth = depth + noise * np.random.default_rng(0).normal(size=depth.shape) * depth**2

@@ -11,7 +11,7 @@ from rangeseg_ros.core.arrays import Labels
 from rangeseg_ros.core.by_normals import method as by_normals
 from rangeseg_ros.core.by_planes import method as by_planes
 from rangeseg_ros.core.by_planes.borders import with_sharp_borders
-from rangeseg_ros.core.by_planes.posterior import plane_probabilities
+from rangeseg_ros.core.by_planes.posterior import calibrated, plane_posteriors
 from rangeseg_ros.core.by_planes.surfaces import unite_regions
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane, describe_regions
@@ -145,14 +145,14 @@ class Segmenter:
         sums = sum_regions(regions, view.image, blocks.result(), errors)
         regions, pairs, sums = unite_regions(regions, sums, view, config.plane_smoothness)
         fits = Fits.of(sums, errors, image.camera is None)
-        probable = Task(plane_probabilities, fits, pairs, config.plane_prior)
+        posterior = Task(plane_posteriors, fits, pairs)
         pixels: Task[Labels] | None = None
         if isinstance(labelling, by_planes.Labelling) and side > 1:
             given = regions, labelling.labels, labelling.models, image, side, sensor
             pixels = Task(
                 with_sharp_borders, *given, config.plane_smoothness * sensor.pixel_inflation
             )
-        roots, probability = fits.roots(), probable.result()
+        roots, probability = fits.roots(), calibrated(posterior.result())
         # Method normals drops no region.
         flat = (probability >= config.plane_probability) | (config.method == 'normals')
         flat[0] = True

@@ -80,8 +80,7 @@ def read_segcomp(image: Path, truth: Path, sensor: str, split: str, number: int)
             seen = abw_range_image(values, abw_calibration(number, split))
     else:
         seen = perceptron_range_image(read_perceptron(image))
-    labels = Truth(read_label_image(truth), None)
-    return Sample(seen, labels, read_angles_beside(truth), {})
+    return Sample(seen, Truth(read_label_image(truth), None), read_angles_beside(truth), {})
 
 
 def read_depth_case(

@@ -78,8 +78,7 @@ def as_truth(labels: NDArray[np.uint16], min_pixels: int = 1) -> Truth:
     """
     curved = labels == NOT_PLANAR
     judged = labels > 0 if curved.any() else None
-    sizes = np.bincount(labels.ravel(), minlength=1)
-    keep = sizes >= min_pixels
+    keep = np.bincount(labels.ravel(), minlength=1) >= min_pixels
     regions = np.where(keep[labels] & ~curved, labels, 0).astype(np.uint16)
     return Truth(regions, judged, min_pixels)
 

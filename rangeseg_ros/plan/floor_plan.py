@@ -186,8 +186,7 @@ def make_plan(
     squared = [plane.named(role=role) for plane, role in zip(squared, roles, strict=True)]
     # Ground that errs by less than a cell is ground.
     band = (max(config.obstacle_height, resolution), headroom)
-    upright = map(motion.apply, points)
-    grid = occupancy(upright, ground, band, resolution)
+    grid = occupancy(map(motion.apply, points), ground, band, resolution)
     reach = ground + band[0], ground + headroom
     found = (
         _wall(k, plane, reach, resolution)

@@ -140,6 +140,5 @@ class Locator:
         at_rest = abs(size / STANDARD_GRAVITY - 1) <= AT_REST
         if message.linear_acceleration_covariance[0] == -1 or not at_rest:
             return
-        stamp = nanoseconds(message.header.stamp)
-        new = Reading(message.header.frame_id, stamp, acceleration)
+        new = Reading(message.header.frame_id, nanoseconds(message.header.stamp), acceleration)
         self._reading = self._reading.followed_by(new) if self._reading else new

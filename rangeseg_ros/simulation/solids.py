@@ -131,8 +131,7 @@ def prism(outline: ArrayLike, height: float, rotation: ArrayLike, centre: ArrayL
     corners = np.asarray(outline, np.float64)
     edges = np.roll(corners, -1, axis=0) - corners
     x, y = edges[:, ::-1].T * ([[1], [-1]] / np.linalg.norm(edges, axis=1))
-    offset = -(x * corners[:, 0] + y * corners[:, 1])
-    upright = np.column_stack([x, y, np.zeros(len(x)), offset])
+    upright = np.column_stack([x, y, np.zeros(len(x)), -(x * corners[:, 0] + y * corners[:, 1])])
     return _placed(_flat(np.vstack([upright, _ends(height)])), rotation, centre)
 
 

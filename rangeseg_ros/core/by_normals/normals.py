@@ -23,8 +23,7 @@ def observed_normals(image: RangeImage, grid: Grid, config: Config) -> Singles:
     normals = cross_product(image, config.normal_baseline)
     if config.jump_edges == 'plane':
         reach = config.normal_baseline
-        broken = _within(~grid.right, reach) | _within(~grid.below.T, reach).T
-        normals[broken] = np.nan
+        normals[_within(~grid.right, reach) | _within(~grid.below.T, reach).T] = np.nan
     return normals
 
 

@@ -43,8 +43,7 @@ def refine(
     data = np.full(len(labels), np.nan, np.float32)
     map_halves(_label_blocks, len(surfaces), surfaces, labels, data, problem, models)
     labelling = GridLabelling.of(labels, data, problem.links, problem.width)
-    height = len(labels) // problem.width
-    run_halves(_expand_near, height, labelling, problem, models)
+    run_halves(_expand_near, len(labels) // problem.width, labelling, problem, models)
     return labels, models
 
 

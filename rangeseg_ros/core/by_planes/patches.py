@@ -63,8 +63,7 @@ class Nodes(NamedTuple):
         rows, columns = blocks.squared.shape
         right = np.zeros((rows, columns - 1), np.bool_)
         below = np.zeros((rows - 1, columns), np.bool_)
-        given = blocks, view.whole.valid, view.grid, view.sensor
-        map_halves(_weigh, rows, *given, right, below)
+        map_halves(_weigh, rows, blocks, view.whole.valid, view.grid, view.sensor, right, below)
         return cls(blocks.moments, blocks.residual, right, below)
 
 

@@ -81,8 +81,7 @@ class Models(NamedTuple):
         """
         theta, _ = fit_all(moments)
         count = np.maximum(moments[:, COUNT], 1)
-        ratio = moments[:, RATIO] / (count + smooth)
-        granted = (1 + moments[:, SLOPE] / count) * (1 + ratio)
+        granted = (1 + moments[:, SLOPE] / count) * (1 + moments[:, RATIO] / (count + smooth))
         return cls(theta, 0.5 / granted, Shifts.none(len(theta)))
 
 

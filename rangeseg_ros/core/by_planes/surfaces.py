@@ -90,8 +90,7 @@ def unite_regions(
     """
     moments, expected = sums.moments(view.sensor), Expected.of(view, 1, smoothness)
     roots, pairs = _agglomerate(regions.astype(np.int32), *view.grid, moments, expected)
-    pixels = np.bincount(roots, sums.pixels, len(roots)).astype(np.intp)
-    numbers = by_falling_size(pixels)[roots]
+    numbers = by_falling_size(np.bincount(roots, sums.pixels, len(roots)).astype(np.intp))[roots]
     return relabel(regions, numbers), numbers[pairs], sums.united(numbers)
 
 

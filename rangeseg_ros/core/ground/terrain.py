@@ -216,8 +216,7 @@ def _without_ground(
     if height > 0:
         # What is higher than any step is none, nor the ground by a wrong height.
         apart = abs(seen.plane[0]) if seen and seen.plane[0] < HIGHEST_STEP else 0.0
-        distance = np.hypot(cells.place[1], cells.place[2])
-        error = height_sd + np.radians(config.up_sd) * distance
+        error = height_sd + np.radians(config.up_sd) * np.hypot(cells.place[1], cells.place[2])
         bound = config.obstacle_height + apart + _CERTAIN * error
         obstacle |= cells.place[0] + height > bound
     wide = cells.size.enlarged(obstacle[cells.order], image.shape)

@@ -228,8 +228,7 @@ class Adjustment:
                 design[at, 3:, :3] = -cross_matrix(pose.shift - jump.camera)
             design[after:] = 0
             effects.insert(-1, design.reshape(-1, 6))
-            whiten = np.linalg.inv(np.linalg.cholesky(jump.covariance))
-            known.append(sparse.csr_array(whiten))
+            known.append(sparse.csr_array(np.linalg.inv(np.linalg.cholesky(jump.covariance))))
         # No drift is longer than the way.
         known.append(sparse.eye(3) / (1.0 if drifts else _LEAST))
         rest = -poses @ sparse.csr_array(np.hstack(effects))

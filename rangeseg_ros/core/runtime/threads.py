@@ -33,8 +33,7 @@ class Task(Generic[T]):
         self._call = partial(function, *arguments)
         self._future: Future[T] | None = None
         if cv2.getNumThreads() // max(_sharing, 1) > 1:
-            count = min(cv2.getNumThreads(), _MAX_THREADS) - 1
-            self._future = _pool(count).submit(self._call)
+            self._future = _pool(min(cv2.getNumThreads(), _MAX_THREADS) - 1).submit(self._call)
 
     def run(self) -> None:
         """Make the call here, unless a thread has begun it."""

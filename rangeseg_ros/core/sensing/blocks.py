@@ -150,8 +150,7 @@ def _update(
                 for j in range(bj * size, min((bj + 1) * size, width)):
                     alike &= inverse[i, j] == before[i, j]
             if not alike:
-                part = bi, bj, bi + 1, bj + 1
-                _sum_pixels(inverse, rays, pinhole, size, part, blocks)
+                _sum_pixels(inverse, rays, pinhole, size, (bi, bj, bi + 1, bj + 1), blocks)
 
 
 @njit(cache=True, inline='always')
