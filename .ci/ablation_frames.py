@@ -106,14 +106,14 @@ class Frame(NamedTuple):
         }
 
     def damaged(self, damage: str) -> Frame:
-        """With holes in 30 % of the pixels, or every second row and column shown twice."""
+        """With holes in 30 % of the pixels, or every fourth row and column shown four times."""
         inverse, labels = self.image.inverse, self.truth.labels
         if damage == 'holes':
             kept = np.random.default_rng(len(labels)).random(labels.shape) >= 0.3
             inverse, labels = inverse * kept, labels * kept
         else:
-            twice = np.ix_(*(np.arange(n) // 2 * 2 for n in labels.shape))
-            inverse, labels = inverse[twice], labels[twice]
+            shown = np.ix_(*(np.arange(n) // 4 * 4 for n in labels.shape))
+            inverse, labels = inverse[shown], labels[shown]
         inverse.flags.writeable = False
         image = replace(self.image, inverse=inverse)
         return self._replace(kind=damage, image=image, truth=Truth(labels, None), planes={})
@@ -244,10 +244,10 @@ def track_run(frames: Sequence[Any], parameters: Mapping[str, Any]) -> Figures:
 
 
 def tracked_room(seed: int, count: int = 12) -> list[Any]:
-    """A walk through a room, segmented, at 5 Hz."""
+    """A walk through a room and back, segmented, at 5 Hz."""
     scene, frames = kinect_room(seed, 6 * count, walk), []
-    for k in range(count):
-        view = simulate(scene, Kinect(seed), frame=6 * k, seed=seed)
+    for k in range(2 * count):
+        view = simulate(scene, Kinect(seed), frame=6 * min(k, 2 * count - 1 - k), seed=seed + k)
         found = Segmenter().segment(RangeImage.from_depth(view.depth, view.camera))
         faces = {plane.label: plane.face for plane in view.planes}
         frames.append((found.labels, found.planes, (k + 5) * 2 * 10**8, view.labels, faces))

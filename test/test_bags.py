@@ -28,8 +28,7 @@ def test_every_format_gives_the_frames(tmp_path, storage, compressed):
     file = record(path, storage, images, compressed)
     for source in {path, file}:
         with DepthBag(source) as bag:
-            assert len(bag) == 5
-            assert bag.camera_topic == INFO
+            assert len(bag) == 5 and bag.camera_topic == INFO
             frames = list(bag)
         assert [frame.stamp for frame in frames] == [*map(stamp_of, range(5))]
         assert {frame.frame_id for frame in frames} == {'optical'}

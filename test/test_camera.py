@@ -159,8 +159,7 @@ def test_planes_behind_a_lens(model, d, method):
     normal /= np.linalg.norm(normal)
     image = RangeImage.from_depth(-distance / (camera.rays.astype(np.float64) @ normal), camera)
     (plane,) = Segmenter(Config(method=method)).segment(image).planes
-    assert plane.normal @ normal > 1 - 1e-8
-    assert plane.distance == pytest.approx(distance, abs=1e-4)
+    assert plane.normal @ normal > 1 - 1e-8 and plane.distance == pytest.approx(distance, abs=1e-4)
     # The outline is half a pixel wider than the centres of the pixels.
     points = image.points.reshape(-1, 3)
     for end in (np.min, np.max):

@@ -78,8 +78,7 @@ def test_same_seeds_same_frame_and_truth_where_depth_is(tmp_path, name, run):
         simulate(kinect_room(1), SENSORS[name](sensor_seed), camera, seed=seed)
         for sensor_seed, seed in ((2, 1), (2, 3), (3, 1))
     )
-    assert np.array_equal(frame.labels > 0, frame.depth > 0)
-    assert (frame.depth > 0).mean() > 0.5
+    assert np.array_equal(frame.labels > 0, frame.depth > 0) and (frame.depth > 0).mean() > 0.5
     differ = [not np.array_equal(frame.depth, other.depth) for other in others]
     assert differ == [name != 'ideal', name not in ('ideal', 'lidar')]
     words = '--sensor', name, '--sensor-seed', 2, '--seed', 1, '--scenes', 1, '--width', 160
@@ -154,8 +153,7 @@ def test_shadow_lies_left_of_the_occluder_and_is_as_wide_as_parallax(noise):
     # Real sensors leave three quarters of it blank.
     width = (0.75 if noise == 'measured' else 1.0) * 585 * KINECT_BASELINE * (1 / near - 1 / far)
     # Pixels less than a half behind what is before them are one surface at a grazing angle.
-    assert abs(len(hole) + 0.5 - width) <= 1
-    assert (frame.labels[240, hole] == 0).all()
+    assert abs(len(hole) + 0.5 - width) <= 1 and (frame.labels[240, hole] == 0).all()
 
 
 @pytest.mark.parametrize('sensor', [*(Kinect(0, noise) for noise in NOISES[:3]), RealSense()])

@@ -49,8 +49,7 @@ def covered(labels):
 def test_a_plane_is_one_surface(noise):
     labels, moments = grown(plane(WALL), noise)
     assert labels.shape == (60, 80) and covered(labels) > 0.95
-    assert moments.shape == (2, 13)
-    assert not moments[0].any()
+    assert moments.shape == (2, 13) and not moments[0].any()
     np.testing.assert_allclose(fit_all(moments)[0][1], WALL, atol=3e-4)
 
 

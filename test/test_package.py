@@ -34,8 +34,7 @@ def test_setup_package_xml_and_citation_agree(setup_arguments):
     package = ElementTree.parse(ROOT / 'package.xml').getroot()
     citation = yaml.safe_load((ROOT / 'CITATION.cff').read_text())
     assert setup_arguments['version'] == citation['version'] == __version__
-    assert setup_arguments['license'] == citation['license']
-    assert package.get('format') == '3'
+    assert setup_arguments['license'] == citation['license'] and package.get('format') == '3'
     for tag in ('name', 'version', 'license'):
         assert package.findtext(tag) == setup_arguments[tag]
     assert package.findtext('export/build_type') == 'ament_python'

@@ -55,8 +55,7 @@ def test_the_filter_knows_how_far_it_is_off(pattern):
         covariance = filters.planes.covariances(filters.covariance)[0]
         values.append(error @ np.linalg.pinv(covariance, 1e-10) @ error / 3)
         errors.append(np.linalg.norm(error[:3]))
-    assert 0.7 < np.mean(values) < 1.4
-    assert np.median(errors) < np.radians(0.4)
+    assert 0.7 < np.mean(values) < 1.4 and np.median(errors) < np.radians(0.4)
 
 
 def image_and_truth(scene, k=0, seed=0, camera=CAMERA):
@@ -122,8 +121,7 @@ def test_parts_that_turn_out_to_be_one_surface_become_one_plane():
     # Not what a frame finds on two surfaces, though the second one is new.
     assert counts[3] == 2
     (wall,) = plane_map.planes
-    assert wall.observations == 2 * 8 - 1
-    assert plane_map.successors == {wall.id + 1: wall.id}
+    assert wall.observations == 2 * 8 - 1 and plane_map.successors == {wall.id + 1: wall.id}
     assert wall.area == pytest.approx(sum(plane.area for plane in parts), rel=0.15)
 
 

@@ -10,9 +10,11 @@ from planes_of_labels import fit_planes
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import Camera, RangeImage
+from rangeseg_ros.core.by_planes.surfaces import unite_regions
 from rangeseg_ros.core.fitting.region_sums import POINT, sum_regions
 from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, roots, squares
 from rangeseg_ros.core.sensing.blocks import Blocks
+from rangeseg_ros.core.sensing.grid import View, grid_of
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
 from rangeseg_ros.simulation.fields import smooth_field
@@ -224,6 +226,15 @@ def test_sums_of_regions_are_those_over_their_pixels(form):
     box, (one, _, other) = united.box[1], sums.box[1:]
     assert [*np.minimum(one, other)[:2], *np.maximum(one, other)[2:]] == box.tolist()
     assert united.start[2] <= 64
+
+
+def test_a_region_of_bridged_pixels_joins_the_one_beside():
+    whole, regions = plane_image(), boxes((100, 100, 200, 300), (200, 100, 203, 300))
+    image = replace(whole, inverse=whole.inverse * (regions != 2))
+    sums = sum_regions(regions, image, Blocks.of(image), KINECT)
+    view = View(image, whole, grid_of(whole), KINECT, 300, image.pixel_area, True)
+    united, _, sums = unite_regions(regions, sums, view, 1.2)
+    assert (united == (regions > 0)).all() and sums.pixels.tolist() == [0, 20000]
 
 
 def test_a_plane_by_another_name_is_the_same_plane():

@@ -106,8 +106,7 @@ def read_scan(image: Path, truth: Path) -> Sample:
     # Such scans count their columns from right to left.
     x, y, z, label = np.moveaxis(read_pcd(image, *'xyz', 'intensity')[:, ::-1], 2, 0)
     seen = RangeImage.from_points(np.stack([-y, -z, x], axis=2).astype(np.float64))
-    planar = np.isfinite(label) & (label >= FIRST_REGION)
-    labels = np.where(planar, label, 0).astype(np.uint16)
+    labels = np.where(np.isfinite(label) & (label >= FIRST_REGION), label, 0).astype(np.uint16)
     return Sample(seen, Truth(labels, None), [], {})
 
 

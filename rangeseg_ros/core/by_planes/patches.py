@@ -145,15 +145,17 @@ def _patches(
     kept, count = np.empty(len(root), np.intp), 0
     number = np.zeros(len(root), np.uint32)
     for a in range(len(root)):
-        if smooth[a] and root[a] == a:
+        if root[a] == a and blocks[a, COUNT] > 0:
             kept[count], number[a], count = a, count, count + 1
     kept = kept[:count]
     chains = _chains(number[root], smooth.reshape(shape), right, below, count)
     grown = _grow(blocks[kept], residual[kept], chains, largest, block_inflation)
+    labels, moments = renumbered(grown, blocks[kept], 1.0)
+    patch = np.zeros(len(root), np.int32)
     for a in range(len(root)):
-        if smooth[a]:
-            root[a] = kept[grown[number[root[a]]]]
-    return renumbered(root, nodes.moments[first:after].reshape(-1, SIZE), 1.0)
+        if blocks[a, COUNT] > 0:
+            patch[a] = labels[number[root[a]]]
+    return patch, moments
 
 
 @njit(cache=True)

@@ -120,7 +120,7 @@ def find_roots(parent: NDArray[Any]) -> NDArray[Any]:
 
 
 @njit(cache=True, nogil=True)
-def renumbered(root: Indices, moments: Floats, least: float) -> tuple[Ints, Floats]:
+def renumbered(root: NDArray[np.integer], moments: Floats, least: float) -> tuple[Ints, Floats]:
     """Number the clusters of at least so many pixels 1...K, the rest 0; their moments."""
     pixels, number, count = np.zeros(len(root)), np.zeros(len(root), np.int32), 0
     for a in range(len(root)):

@@ -185,6 +185,5 @@ def _misfit(
     smoothly = pixels * distortion_share(pixels, smooth)
     smoothly -= first * distortion_share(first, smooth) + second * distortion_share(second, smooth)
     # Sums of squares of a bend grow as pixels^2: N^2 - n^2 - m^2 = 2 n m more than in the parts.
-    squares = moments[k, CHI2] + moments[m, CHI2]
-    bent = bend * squares * 2 * first * second / pixels
+    bent = bend * (moments[k, CHI2] + moments[m, CHI2]) * 2 * first * second / pixels
     return extra / (_NOISE * expected.block_inflation + _WITHIN * (ratio * smoothly + bent))

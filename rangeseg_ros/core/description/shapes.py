@@ -246,5 +246,4 @@ def _rectangle(
         frame[a, 2] = (p, q, r)[a]
         centre[a] = origin[a] + (left + most) / 2 * frame[a, 0] + (low + high) / 2 * frame[a, 1]
     extents = np.array([most - left, high - low])
-    footprint = abs(area / inside) if inside != 0 else 0.0
-    return footprint, extents, centre, frame
+    return abs(area / inside) if inside != 0 else 0.0, extents, centre, frame

@@ -99,7 +99,10 @@ class RegionSums(NamedTuple):
         moments[:, : CHI2 + 1] = cells[:, : CHI2 + 1] * unit[:, None]
         moments[:, COUNT] = cells[:, COUNT]
         moments[:, RATIO] = cells[:, COUNT] * systematic_variance(sensor, squared) / variance
-        return sum_by_label(self.owners, moments, len(self.box))
+        total = sum_by_label(self.owners, moments, len(self.box))
+        # In a region of bridged pixels alone, nothing was measured.
+        total[1:, COUNT] = np.maximum(total[1:, COUNT], 1)
+        return total
 
 
 def sum_regions(

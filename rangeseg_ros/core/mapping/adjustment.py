@@ -190,8 +190,7 @@ class Adjustment:
             design, gap = state.equations(sightings, rest)
             known = np.concatenate([np.zeros(first), state.pose_errors(told), rest])
             # Cauchy's weights: things that move by themselves are not to move the camera.
-            off = (gap.reshape(-1, 3) ** 2).sum(axis=1)
-            scale = np.repeat(1 / np.sqrt(1 + off / GATE), 3)
+            scale = np.repeat(1 / np.sqrt(1 + (gap.reshape(-1, 3) ** 2).sum(axis=1) / GATE), 3)
             rows = sparse.vstack([sparse.diags(scale) @ design, prior]).tocsr()
             factors = splu((rows.T @ rows).tocsc(), 'MMD_AT_PLUS_A', 0.0, options=_SYMMETRIC)
             step = factors.solve(rows.T @ np.concatenate([scale * gap, -prior @ known]))

@@ -102,8 +102,7 @@ def _lens(model: str, d: Sequence[float]) -> Callable[[Complex], tuple[Complex, 
         slope = (above.deriv()(s) - g * below.deriv()(s)) / below(s)
         bent = 2 * p + prism.deriv()(s)
         along = g + slope * s + 2 * np.conj(p) * z + bent * z.conj()
-        across = z * (slope * z + bent)
-        return z * (g + np.conj(p) * z) + 2 * p * s + prism(s), along, across
+        return z * (g + np.conj(p) * z) + 2 * p * s + prism(s), along, z * (slope * z + bent)
 
     return lens
 
