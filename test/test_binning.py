@@ -175,6 +175,9 @@ def test_borders_are_those_of_pixels():
     assert np.count_nonzero(result.labels != truth) < 0.2 * 480, 'a fifth of a pixel along one'
     counts = [plane.count for plane in result.planes]
     assert [0, *counts] == np.bincount(result.labels.flat).tolist()
+    # A plane that loses all of its pixels is none.
+    left = result.of_pixels(result.labels * np.uint16(result.labels < 3), result.image, None)
+    assert [plane.count for plane in left.planes] == counts[:2] and left.normals.any()
 
 
 @pytest.fixture(scope='module')

@@ -49,8 +49,7 @@ def test_what_has_left_the_view_is_remembered_where_it_was():
         grid = drive.grid(0.1 * k, 0.2 * k)
     assert grid.frame == 'map' and grid.resolution == 0.05
     # 1.1 m on, the box is 0.3 m ahead and below the view.
-    assert at(grid, 1.4, 0.3) == OBSTACLE
-    assert at(grid, 1.4, -0.3) == GROUND
+    assert at(grid, 1.4, 0.3) == OBSTACLE and at(grid, 1.4, -0.3) == GROUND
     assert at(grid, 1.4, -0.3, grid.height) == pytest.approx(GROUND_IN_MAP, abs=0.02)
     assert grid.origin[2] == pytest.approx(GROUND_IN_MAP, abs=0.02)
     assert at(grid, 1.4, -0.3, grid.age) > 0.3

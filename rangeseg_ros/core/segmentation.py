@@ -167,11 +167,13 @@ class Segmentation:
         return judge(self.image, self.labels, thetas, self.curved, self.identified, self.values)
 
     def of_pixels(self, labels: Labels, image: RangeImage, cells: Cells) -> Segmentation:
-        """The result of the image whose `cells` it is of, with labels (H, W) of its pixels."""
-        counts = region_sizes(
-            labels, max((plane.label for plane in self.planes), default=0) + 1
-        ).tolist()
-        planes = [plane.named(count=counts[plane.label]) for plane in self.planes]
+        """The result of the image whose `cells` it is of, with labels (H, W) of its pixels.
+
+        A plane that none of these has is left out.
+        """
+        last = max((plane.label for plane in self.planes), default=0)
+        counts = region_sizes(labels, last + 1).tolist()
+        planes = [p.named(count=counts[p.label]) for p in self.planes if counts[p.label]]
         return replace(self, labels=labels, planes=planes, image=image, cells=cells)
 
     @property

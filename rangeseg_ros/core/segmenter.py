@@ -14,7 +14,7 @@ from rangeseg_ros.core.by_planes.borders import with_sharp_borders
 from rangeseg_ros.core.by_planes.posterior import calibrated, plane_posteriors
 from rangeseg_ros.core.by_planes.surfaces import unite_regions
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.description.planes import Plane, describe_regions
+from rangeseg_ros.core.description.planes import describe_regions
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.noise import measured_sensor, nested, quantisation
 from rangeseg_ros.core.fitting.region_sums import sum_regions
@@ -171,7 +171,7 @@ class Segmenter:
             labels,
             planes,
             watch.laps,
-            _reason(image, planes),
+            '',
             sensor,
             labelling,
             jumps,
@@ -184,7 +184,7 @@ class Segmenter:
         if pixels:
             result = result.of_pixels(labels, image, Cells(side, 0, 0))
         watch.lap('planes')
-        return result
+        return result if result.planes else replace(result, reason=_reason(image))
 
 
 def _binned(image: RangeImage, side: int) -> tuple[Bins, list[Blocks]]:
@@ -232,10 +232,8 @@ def _preprocessed(
     return View(image, whole, *known), sensor.of_pixels(side, excess), jumps, blocks
 
 
-def _reason(image: RangeImage, planes: list[Plane]) -> str:
-    """Why there is no plane; empty when there is one."""
-    if planes:
-        return ''
+def _reason(image: RangeImage) -> str:
+    """Why there is no plane in an image."""
     if not image.valid.any():
         return 'no valid depth' if image.body is None else 'no valid depth outside the mask'
     return 'no flat region large enough'
