@@ -229,7 +229,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 yield task.row['kind'], lambda parameters, task=task: terrain_run(task, parameters)
 
     def of_walks() -> Iterator[tuple[str, Run]]:
-        for room in range(seed, seed + 2 * scenes):
+        for room in range(seed, seed + 6 * scenes):
             frames = tracked_room(room)
             yield str(room), lambda parameters, frames=frames: track_run(frames, parameters)
 
