@@ -57,8 +57,8 @@ class Plane:
         the sensor model expects of them over the observed one where that is larger. About 1 for
         planes, less for what is bent, rough or spills over its border.
     probability : float
-        0...1: posterior probability that the region is a plane and no curved surface, see
-        `by_planes.posterior`.
+        0...1: that the region is a plane and no curved surface; of regions with 0.9, nine of ten
+        are, see `by_planes.posterior`.
     outline : Outline
         What `hull` and `holes` are made of when first asked for.
     shape : Shape or RegionShape

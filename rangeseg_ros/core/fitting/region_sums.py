@@ -126,11 +126,10 @@ def sum_regions(
     inliers, outliers = (
         np.bincount(owners, part[:, COUNT], count).astype(np.intp) for part in (cells, outside)
     )
-    measured = inliers + outliers
-    many = 2 * outliers > measured
+    many = outliers > inliers
     if many.any():
         cells += outside * many[owners, None]
-    return RegionSums._of_cells(layout, cells, measured, outliers)
+    return RegionSums._of_cells(layout, cells, inliers + outliers, outliers)
 
 
 def fit_sums(total: Floats) -> Floats:
@@ -251,6 +250,7 @@ def _accumulate(
     """
     (height, width), columns, count = labels.shape, inside.shape[1], layout.start[-1]
     cells, moments = np.zeros((2 * count, RECORD)), blocks.moments.reshape(-1, SIZE)
+    # By index: views of arrays would count references, those of the same arrays in both halves.
     for bi in range(first, after):
         bottom = min((bi + 1) * BLOCK, height)
         for bj in range(columns):
