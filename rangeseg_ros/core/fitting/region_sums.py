@@ -77,12 +77,12 @@ class RegionSums(NamedTuple):
 
     @classmethod
     def _of_cells(
-        cls, layout: Layout, cells: Floats, pixels: Indices, outliers: Indices
+        cls, box: Indices, start: Indices, cells: Floats, pixels: Indices, outliers: Indices
     ) -> RegionSums:
         """Those of all cells of a layout, of which those with pixels are kept."""
         kept = cells[:, COUNT] > 0
-        start = np.searchsorted(np.flatnonzero(kept), layout.start)
-        return cls(layout.box, start, cells[kept], pixels, outliers)
+        start = np.searchsorted(np.flatnonzero(kept), start)
+        return cls(box, start, cells[kept], pixels, outliers)
 
     def total(self) -> Floats:
         """Sums (M + 1, 29) over the cells of each region."""
@@ -114,7 +114,7 @@ def sum_regions(
     blocks (of 4 x 4 pixels) that the region fills. It keeps them where they are more than half of
     it: then the sensor model does not fit, or there is no plane.
     """
-    layout = _layout(find_boxes(labels, int(labels.max(initial=0)) + 1))
+    layout = Layout(*_layout(find_boxes(labels, int(labels.max(initial=0)) + 1)))
     inside = _labels_of_blocks(labels)
     axis = image.camera.axes[:, 2].copy() if image.camera is not None else np.zeros(3)
     pixels = labels, inside, image.inverse, image.rays, image.pinhole, image.camera is not None
@@ -129,7 +129,7 @@ def sum_regions(
     many = outliers > inliers
     if many.any():
         cells += outside * many[owners, None]
-    return RegionSums._of_cells(layout, cells, inliers + outliers, outliers)
+    return RegionSums._of_cells(layout.box, layout.start, cells, inliers + outliers, outliers)
 
 
 def fit_sums(total: Floats) -> Floats:
@@ -164,8 +164,8 @@ def find_boxes(labels: NDArray[np.integer], count: int) -> Indices:
 
 
 @njit(cache=True, nogil=True)
-def _layout(box: Indices) -> Layout:
-    """Cells of whole blocks in bounding boxes (M + 1, 4), as small as may be."""
+def _layout(box: Indices) -> tuple[Indices, Floats, Indices, Indices]:
+    """`Layout` of whole blocks in bounding boxes (M + 1, 4), with cells as small as may be."""
     start = np.zeros(len(box) + 1, np.intp)
     scale, columns = np.empty(len(box)), np.empty(len(box), np.intp)
     for k in range(len(box)):
@@ -176,12 +176,12 @@ def _layout(box: Indices) -> Layout:
             side += 1
         scale[k], columns[k] = 1 / side, -(-across // side)
         start[k + 1] = start[k] - (-rows // side) * columns[k]
-    return Layout(box, scale, columns, start)
+    return box, scale, columns, start
 
 
 @njit(cache=True, nogil=True)
-def _united(number: Labels, sums: RegionSums) -> tuple[Layout, Floats]:
-    """Cells of regions by another number, 0 for none, and the sums (N, 29) over these."""
+def _united(number: Labels, sums: RegionSums) -> tuple[Indices, Indices, Floats]:
+    """Boxes and cells of regions by another number, 0 for none; sums (N, 29) over the cells."""
     box = np.zeros((int(number.max()) + 1, 4), np.intp)
     known = np.flatnonzero(number)
     for k in known:
@@ -190,7 +190,7 @@ def _united(number: Labels, sums: RegionSums) -> tuple[Layout, Floats]:
         for side in range(2):
             whole[side] = own[side] if first else min(whole[side], own[side])
             whole[2 + side] = max(whole[2 + side], own[2 + side])
-    layout = _layout(box)
+    layout = Layout(*_layout(box))
     cells = np.zeros((layout.start[-1], RECORD))
     for k in known:
         for i in range(sums.start[k], sums.start[k + 1]):
@@ -199,7 +199,7 @@ def _united(number: Labels, sums: RegionSums) -> tuple[Layout, Floats]:
             c = _cell_of(layout, number[k], int(row) // BLOCK, int(column) // BLOCK)
             for entry in range(RECORD):
                 cells[c, entry] += cell[entry]
-    return layout, cells
+    return layout.box, layout.start, cells
 
 
 @njit(cache=True, nogil=True)
