@@ -74,8 +74,7 @@ def test_where_nothing_can_be_kept_kernels_last_as_long_as_the_process(tmp_path)
 def test_where_nothing_can_be_written_one_line_says_so(start):
     code = "tempfile.mkdtemp = temporary_file\nsys.argv[1:] = ['compile']\n"
     run = run_restricted(f'{code}from rangeseg_ros.start import {start}; {start}()')
-    assert run.returncode == 2
-    assert run.stderr.startswith(start) and run.stderr.count('\n') == 1
+    assert run.returncode == 2 and run.stderr.startswith(start) and run.stderr.count('\n') == 1
     assert 'NUMBA_CACHE_DIR' in run.stderr
 
 
@@ -175,8 +174,7 @@ def test_kernels_are_compiled_anew_when_what_they_call_has_changed(tmp_path):
         done = python(CALL, cwd=tmp_path, env=environment)
         return done.stdout.split() or done.stderr
 
-    assert call() == ['1', '3', '0', '0']
-    assert call() == ['1', '3', '1', '1']
+    assert call() == ['1', '3', '0', '0'] and call() == ['1', '3', '1', '1']
     # Neither its time nor its size tells.
     changed = package / 'core' / 'a.py'
     before = changed.stat()

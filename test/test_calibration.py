@@ -92,8 +92,7 @@ def test_second_coefficient_where_the_range_is_offset():
     moments = [distortion.offset * part for part in (1, *np.indices(CAMERA.shape))]
     # Of what was not seen nothing is told; the rest has no plane in it.
     assert distortion.offset[:44].any() and not distortion.offset[46:].any()
-    assert abs(distortion.slope.mean()) < 1e-6
-    assert abs(np.mean(moments, axis=(1, 2))).max() < 1e-6
+    assert abs(distortion.slope.mean()) < 1e-6 and abs(np.mean(moments, axis=(1, 2))).max() < 1e-6
     for inverse in (0.45, 0.6, 0.9):
         error = distortion.offset + distortion.slope * (inverse - distortion.reference)
         truth = inverse**2 * offset
@@ -107,8 +106,7 @@ def test_weights_settle_to_those_of_the_field_of_the_frames_that_count():
     first = cells.frame[cells.plane()] < 4
     other = cells._replace(inverse=np.where(first, 2 * cells.inverse**2, cells.inverse))
     one, two = (_blocks(each, grid) for each in (cells, other))
-    assert np.array_equal(one[0][1], two[0][1])
-    assert not np.array_equal(one[1][1], two[1][1])
+    assert np.array_equal(one[0][1], two[0][1]) and not np.array_equal(one[1][1], two[1][1])
     truth = true_map().reshape(30, 2, 40, 2).mean(axis=(1, 3)).ravel()[cells.cell]
     known, none = (robust_weights(cells, field) for field in (truth, 0.0))
     assert rms(_settled_weights(cells, grid) - known) < 0.5 * rms(none - known)
@@ -282,13 +280,11 @@ def test_interrupted_run_goes_on_where_it_was(folder, tmp_path, monkeypatch, run
         return real(labels, image)
 
     monkeypatch.setattr('rangeseg_ros.batch.calibration.find_sightings', counting)
-    assert run('calibrate', *arguments, '--jobs', 1)[0] == 130
-    assert not output.exists()
+    assert run('calibrate', *arguments, '--jobs', 1)[0] == 130 and not output.exists()
     code, _, error = run('calibrate', *arguments, '--jobs', 1)
     assert code == 0, error
     # Of the first part of ten frames nothing is done again.
-    assert len(segmented) == 15 + 12
-    assert not list(tmp_path.glob('.*'))
+    assert len(segmented) == 15 + 12 and not list(tmp_path.glob('.*'))
 
 
 def test_bad_input_ends_in_one_line_and_writes_nothing(folder, tmp_path, refused):

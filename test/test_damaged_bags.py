@@ -91,8 +91,7 @@ def test_one_bad_frame_costs_one_frame(tmp_path, bad, number, name):
     with_bad_frame(tmp_path / name, bad, number)
     numbers, bag = numbers_of(tmp_path / name, depth_topic=DEPTH)
     assert numbers == [index for index in range(6) if index != number]
-    assert bag.lost.total() == 1
-    assert '1 of 6' in bag.loss() and 'other reasons' not in bag.loss()
+    assert bag.lost.total() == 1 and '1 of 6' in bag.loss() and 'other reasons' not in bag.loss()
 
 
 def test_a_message_that_is_no_message_costs_one_frame(tmp_path):
@@ -103,8 +102,7 @@ def test_a_message_that_is_no_message_costs_one_frame(tmp_path):
     data[places[2] - 4 : places[2]] = b'\xff' * 4
     file.write_bytes(data)
     numbers, bag = numbers_of(tmp_path / 'bag')
-    assert numbers == [0, 1, 3, 4, 5]
-    assert 'damaged message' in bag.loss()
+    assert numbers == [0, 1, 3, 4, 5] and 'damaged message' in bag.loss()
 
 
 def test_a_replay_leaves_out_a_bad_frame_and_says_so(tmp_path, run):

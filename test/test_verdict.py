@@ -122,6 +122,14 @@ def test_simulated_images_are_trusted(sensor, seed):
     assert verdict.ok and str(verdict) == 'trusted'
 
 
+def test_of_planes_in_a_line_the_share_of_range_is_told_or_unknown():
+    camera, theta = Camera(320, 240, 150.0, 150.0, 159.5, 119.5), np.array([0.1, -0.2, 0.5])
+    for column in range(320):
+        rays = camera.rays[:60, column].astype(float)
+        share, variance = _share_of_range(rays, (rays @ theta).astype(np.float32), theta)
+        assert abs(share) < 0.01 and np.isfinite(variance)
+
+
 def test_a_kinect_that_is_misread_is_told(seen):
     distances = seen.depth * np.linalg.norm(seen.camera.rays, axis=2) / 1000
     for depth, unit, reason, told in (

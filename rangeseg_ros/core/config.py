@@ -258,7 +258,7 @@ def _check_names(kind: type[Config], names: Iterable[object]) -> None:
 _RENAMED = {'sensor_height_noise': 'sensor_height_sd', 'up_noise': 'up_sd'}
 # Former parameters that nothing reads any more; CHANGELOG.rst has the reasons.
 _DROPPED = ['directions', 'cycles', 'flatness', 'noise_regions', 'moves', 'refits']
-_DROPPED += ['track_memory', 'warm_start']
+_DROPPED += ['plane_prior', 'track_memory', 'warm_start']
 
 NAMES = frozenset((*_RENAMED, *_DROPPED, *Config.__dataclass_fields__))
 """What parameters are, or were, called."""

@@ -196,8 +196,7 @@ def _with_ground(
     # By similar triangles: the ray to a place so high above the ground crosses it farther away.
     share = np.float32(1) + height * np.tensordot(cells.axes[0].astype(np.float32), field.theta, 1)
     share[share <= 0] = np.nan
-    crossing = cells.place[1:] / share
-    below = CellTerrain(cells.place, height, kind, cells.error, crossing)
+    below = CellTerrain(cells.place, height, kind, cells.error, cells.place[1:] / share)
     field = field._replace(theta=np.ascontiguousarray(field.theta[:, cells.order]))
     return Terrain(*classify(image, field, bounds[:, cells.order]), stand, field, below)
 

@@ -194,10 +194,11 @@ def _share_of_range(rays: Floats, inverse: Singles, theta: Floats) -> tuple[floa
     """Share of the bend in one plane, and its variance; what does not fit is left out."""
     bend = (rays @ theta) * (1 / np.linalg.norm(rays, axis=1) - 1)
     terms = np.column_stack([rays, bend])
-    kept = np.ones(len(rays), np.bool_)
+    # Of pixels in a line the terms depend on each other, but for how rays are rounded.
+    kept, rounding = np.ones(len(rays), np.bool_), np.finfo(np.float32).eps ** 2 * np.eye(4)
     for _ in range(2):
         square = terms[kept].T @ terms[kept]
-        covariance = np.linalg.inv(square + np.finfo(float).eps * np.trace(square) * np.eye(4))
+        covariance = np.linalg.inv(square + np.trace(square) * rounding)
         solution = covariance @ (terms[kept].T @ inverse[kept])
         left = np.abs(inverse - terms @ solution)
         variance = np.mean(left[kept] ** 2) * covariance[3, 3]
