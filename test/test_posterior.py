@@ -10,7 +10,7 @@ from rangeseg_ros.core.by_planes.posterior import _evidence, calibrated, plane_p
 from rangeseg_ros.core.by_planes.shifts import shift_at, shifts
 from rangeseg_ros.core.fitting.region_sums import INVERSE, PLACE, RAY, WEIGHT
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO
-from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
+from rangeseg_ros.core.sensing.sensor import SensorModel, distortion_share, random_variance
 from rangeseg_ros.simulation.fields import smooth_field
 from rangeseg_ros.simulation.sensors.kinect import QUANTUM
 
@@ -67,7 +67,7 @@ def test_planes_that_the_sensor_bends_are_planes_and_cylinders_none(seed):
 def test_evidence_moves_the_calibrated_odds_evenly():
     found = calibrated(np.array([0, 0.2, 0.5, 0.8, 1]))
     odds = np.log(found[1:4] / (1 - found[1:4]))
-    assert (found[0], found[4]) == (0, 1) and np.diff(odds) == pytest.approx(2.9 * np.log([4, 4]))
+    assert (found[0], found[4]) == (0, 1) and np.diff(odds) == pytest.approx(2.6 * np.log([4, 4]))
     assert 0 < found[2] - Config().plane_probability < 0.001
 
 
@@ -124,26 +124,26 @@ def test_the_evidence_is_that_of_residuals_along_the_crease():
     v, u = (cells[:, PLACE + k] / cells[:, COUNT] / 100 for k in range(2))
     terms = root[:, None] * np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
     crease = planes - terms @ np.linalg.lstsq(terms, planes, rcond=None)[0]
-    for k in range(2):
-        mine = part == k
+    ratio, expected = own**2 - (own + crease / 2) ** 2, 0.0
+    for mine in (part == 0, part == 1):
         noise = max(sensor.region_inflation, own[mine] @ own[mine] / (mine.sum() - 3))
-        ratio = own[mine] @ own[mine] - ((own + crease)[mine] ** 2).sum()
-        assert found[k] == pytest.approx(ratio / (2 * noise), rel=1e-5)
-    assert min(found) > 0
+        smooth = 2 * distortion_share(cells[mine, COUNT].sum(), sensor.distortion_pixels)
+        expected += ratio[mine].sum() / (2 * noise * max(smooth, 1))
+    assert found == pytest.approx(expected) and found > 0
 
 
 @pytest.mark.parametrize(('bend', 'width'), [(1.0, 0.15), (1.0, 0.1), (0.5, 0.1), (0.2, 0.08)])
 def test_two_regions_are_one_surface_as_far_as_their_evidence_says(bend, width):
-    """Each is told as much from the same probability of both together."""
+    """By Bayes' theorem, over all that the two may be."""
     inverse = 0.5 + 0.05 * X - bend * X**2 - 0.05 * X * CAMERA.rays[..., 1]
     inside = (-0.6 * width < X) & (width > X) & (abs(CAMERA.rays[..., 1]) < width)
     regions = np.where(X < 0, 1, 2) * inside
     sums, _, theta, *_ = fitted(inverse, regions)
-    own = np.array(_evidence(sums, 1, 2, theta, SENSOR, SENSOR.region_inflation))
+    ratio = np.exp(_evidence(sums, 1, 2, theta, SENSOR, SENSOR.region_inflation))
     alone, beside = alone_and_beside(inverse, regions, [1, 2])
-    change = (beside - alone)[1:]
-    together = alone[1:] + change * (1 + np.exp(-own) + np.exp(-own.sum()))
-    assert together[0] == pytest.approx(together[1], abs=1e-6) and abs(change).max() > 1e-3
+    joint = np.outer([alone[1], 1 - alone[1]], [alone[2], 1 - alone[2]]) * [[1, 1], [1, ratio]]
+    found = joint.sum(axis=1)[0], joint.sum(axis=0)[0]
+    assert beside[1:] == pytest.approx(np.minimum(found / joint.sum(), alone[1:]))
 
 
 def test_what_tells_nothing_has_the_prior():

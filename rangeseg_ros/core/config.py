@@ -60,7 +60,7 @@ class Config:
         1.2, 'lambda of eq. 5.3 against half the squared residuals, of planes', 0.0, 10000.0
     )
     plane_probability: float = option(
-        0.065, 'smallest probability of a plane, no curved surface; 0 = planes of all', 0.0, 1.0
+        0.09, 'smallest probability of a plane, no curved surface; 0 = planes of all', 0.0, 1.0
     )
     exact: bool = option(
         False, 'method normals: every label over all of the image until none changes (minutes)'
