@@ -194,10 +194,11 @@ What each mechanism (`.ci/mechanisms.py`) costs and buys: `make ablate` (`.ci/ab
   the change when it is switched off, plus or minus the standard error over sensors, kinds of
   scenes or rooms; of an option, off by default, what is lacking without it.
 - IoU in thousandths, of sensors by their kind, of simulated rooms, and of those in which 30 % of
-  the pixels are lost (*holes*) or all but every fourth row and column (*enlarged*). *curved*:
-  share of what is not planar that is called a plane. In simulated rooms *border*: F measure of
-  borders within 2 pixels; *faces*: IoU of faces seen in parts; *angle*: median error of normals,
-  thousandths of a degree. Lengths of tracks are in tenths of a frame, of walks and back.
+  the pixels are lost (*holes*) or all but every fourth row and column (*enlarged*), that have 256
+  steps of 8 cm (*rounded*) or that are disparities (*disparity*). *curved*: share of what is not
+  planar that is called a plane. In simulated rooms *border*: F measure of borders within 2 pixels;
+  *faces*: IoU of faces seen in parts; *angle*: median error of normals, thousandths of a degree.
+  Lengths of tracks are in tenths of a frame, of walks and back.
 - *verdict*: earns by a gain above two standard errors in a column, or one over all sensors; harms
   by such a loss; *safety*: the kinds of scenes in which more than 1 % of a hazard is called ground
   without it; *not shown*: all changes are within chance.
@@ -209,7 +210,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--data', type=Path, help='folder of sets of real frames')
     parser.add_argument('--frames', type=int, default=10, help='of a real sensor, at most')
-    parser.add_argument('--scenes', type=int, default=2, help='scenes of each simulated sensor')
+    parser.add_argument('--scenes', type=int, default=3, help='scenes of each simulated sensor')
     parser.add_argument('--seed', type=int, default=41000, help='of the first scene')
     parser.add_argument('--only', default='', help='of the names of mechanisms: a pattern')
     parser.add_argument('--output', type=Path, help='page to write')
@@ -225,8 +226,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     def of_terrains() -> Iterator[tuple[str, Run]]:
         for command in ('terrain', 'terrain --hard'):
             folder = simulated(command, seed, 13 * scenes)
-            for task in terrain_tasks(folder, Config(), True, None):
-                yield task.row['kind'], lambda parameters, task=task: terrain_run(task, parameters)
+            for known in (True, False):
+                for task in terrain_tasks(folder, Config(), known, None):
+                    kind = task.row['kind'] if known else f'{task.row["kind"]}, no height'
+                    yield kind, lambda parameters, task=task: terrain_run(task, parameters)
 
     def of_walks() -> Iterator[tuple[str, Run]]:
         for room in range(seed, seed + 6 * scenes):

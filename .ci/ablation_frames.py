@@ -54,7 +54,8 @@ ROOMS = {
     'kinect, curved': 'kinect --scene curved',
     'realsense, curved': 'rooms --sensor realsense --scene curved',
 }
-DAMAGED, DAMAGES = ('kinect', 'realsense', 'tof'), ('holes', 'enlarged')
+DAMAGED = 'kinect', 'realsense', 'tof'
+DAMAGES = 'holes', 'enlarged', 'rounded', 'disparity'
 # By the names of a set and a frame, the first that fits; all others are of other sensors.
 KINDS = {'Kinect': r'^(annotated|nyu)|kinect', 'RealSense': r'realsense|/rs_|any6d|d4\d\d'}
 
@@ -106,8 +107,14 @@ class Frame(NamedTuple):
         }
 
     def damaged(self, damage: str) -> Frame:
-        """With holes in 30 % of the pixels, or every fourth row and column shown four times."""
-        inverse, labels = self.image.inverse, self.truth.labels
+        """As a worse sensor, or a careless driver, leaves it; see `docs/ledger.md`."""
+        inverse, labels, camera = self.image.inverse, self.truth.labels, self.image.camera
+        if damage in ('rounded', 'disparity'):
+            depth = self.image.points[..., 2]
+            with np.errstate(divide='ignore'):
+                values = np.round(depth / 0.08) * 0.08 if damage == 'rounded' else 40 / depth
+            image = RangeImage.from_depth(np.nan_to_num(values, posinf=0), camera)
+            return self._replace(kind=damage, image=image, planes={})
         if damage == 'holes':
             kept = np.random.default_rng(len(labels)).random(labels.shape) >= 0.3
             inverse, labels = inverse * kept, labels * kept

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rangeseg_ros.core.by_planes.shifts import Shifts
+from rangeseg_ros.core.by_planes.offsets import Offsets
 
 
 class Mechanism(NamedTuple):
@@ -139,17 +139,17 @@ MECHANISMS = (
     Mechanism('regions that touch unite', 'by_planes/surfaces.py:unite_regions',
               {'segmenter.unite_regions': lambda _: lambda regions, sums, *rest:
                (regions, np.zeros((0, 2), np.uint16), sums)}),
-    Mechanism('planes shifted by the distortion', 'by_planes/shifts.py',
-              {'by_planes.labelling.shifts':
-               lambda _: lambda surfaces, blocks, theta, *rest: Shifts.none(len(theta))}),
+    Mechanism('planes moved by the distortion', 'by_planes/offsets.py',
+              {'by_planes.labelling.local_offsets':
+               lambda _: lambda surfaces, blocks, theta, *rest: Offsets.none(len(theta))}),
     Mechanism('labels expanded by cuts', 'by_planes/labelling.py graphcut/cut.py '
               'graphcut/expansion.py',
               {'by_planes.labelling.run_halves': _returning(None)}),
-    Mechanism('labels of pixels, not of blocks', 'by_planes/labelling.py by_planes/shifts.py '
+    Mechanism('labels of pixels, not of blocks', 'by_planes/labelling.py by_planes/offsets.py '
               'graphcut/cut.py graphcut/expansion.py',
               {'by_planes.labelling.run_halves': _returning(None),
-               'by_planes.labelling.shifts':
-               lambda _: lambda surfaces, blocks, theta, *rest: Shifts.none(len(theta))}),
+               'by_planes.labelling.local_offsets':
+               lambda _: lambda surfaces, blocks, theta, *rest: Offsets.none(len(theta))}),
     Mechanism('bins of 2 x 2 pixels, not of 4 x 4', 'sensing/binning.py:widening',
               {'work_budget': 0.9}),
     Mechanism('bins, not pixels', 'sensing/binning.py',

@@ -19,7 +19,7 @@ from rangeseg_ros.evaluation.terrain import MARGIN, REACH
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
 from rangeseg_ros.simulation.terrain.kinds import stated
-from rangeseg_ros.simulation.terrain.testpieces import DISTANCES, all_pieces, piece_scene
+from rangeseg_ros.simulation.terrain.testpieces import DISTANCES, catalogue, piece_scene
 
 # Numbers that a scene draws: roll, pitch, distance, place across, direction.
 DRAWN = 5
@@ -82,7 +82,7 @@ def main() -> None:
     given = parser.parse_args()
     print('| piece | size |', ' | '.join(f'{d:g} m' for d in DISTANCES), '|', flush=True)
     rows: dict[tuple, list[str]] = {}
-    for piece in all_pieces():
+    for piece in catalogue():
         worst = search(piece, given.looks, given.seed, given.sensor, given.mount)
         cell = f'{worst[1]:.2f} ({worst[0]:.2f})' if worst else '-'
         rows.setdefault(piece[:2], []).append(cell)

@@ -6,8 +6,8 @@ from clouds import cloud_of
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.by_planes.borders import with_sharp_borders
+from rangeseg_ros.core.by_planes.offsets import Offsets
 from rangeseg_ros.core.by_planes.plane_energy import CAP, NO_PLANE, Models
-from rangeseg_ros.core.by_planes.shifts import Shifts
 from rangeseg_ros.core.sensing.binning import BUDGETS, Bins, bin_side, widening
 from rangeseg_ros.core.sensing.blocks import NODE
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -131,11 +131,11 @@ def test_pixels_beside_borders_take_the_label_of_the_lowest_cost(side):
     coarse = draw.integers(0, 4, (4, 4), np.uint16).repeat(3, 0).repeat(3, 1)
     regions = np.ascontiguousarray(coarse[: bins[0], : bins[1]])
     theta = np.array([[0, 0, 0], [0.1, 0, 0.5], [0, 0.1, 0.52], [-0.1, 0, 0.49]])
-    # Shifts of every plane at every block of 2 x 2 bins.
+    # Offsets of every plane at every block of 2 x 2 bins.
     blocks = -(-bins[0] // NODE), -(-bins[1] // NODE)
     values = draw.normal(0, 0.05, (4, *blocks)).astype(np.float32)
     box, start = np.tile([0, 0, *blocks], (4, 1)), np.arange(4) * blocks[0] * blocks[1]
-    models = Models(theta, np.array([0, 0.5, 0.4, 0.3]), Shifts(box, start, values.ravel()))
+    models = Models(theta, np.array([0, 0.5, 0.4, 0.3]), Offsets(box, start, values.ravel()))
     truth = draw.integers(1, 4, camera.shape)
     inverse = (theta[truth] * camera.rays).sum(axis=2) + draw.normal(0, 0.01, camera.shape)
     inverse[draw.random(camera.shape) < 0.1] = 0

@@ -231,7 +231,7 @@ def test_a_sequence_is_followed_as_that_of_the_depth_images():
         told.segment(clouds[0], stamp, poses[0].rotation[2], poses[0], poses[0].shift[2])
         found = mapped.segment(clouds[1], stamp, poses[1].rotation[2], poses[1], poses[1].shift[2])
         np.testing.assert_allclose(mapped.pose.shift, poses[1].shift, atol=1e-9)
-        assert found.survey.sensor_height == pytest.approx(pose.shift[2], abs=1e-5)
+        assert found.source.sensor_height == pytest.approx(pose.shift[2], abs=1e-5)
     assert len(told.map) == len(mapped.map) > 3
     for one, other in zip(told.map.planes, mapped.map.planes, strict=True):
         np.testing.assert_allclose(one.normal, other.normal, atol=1e-3)

@@ -16,7 +16,7 @@ from rangeseg_ros.evaluation.detection import LEVEL, lower_bound
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.io.tables import write_table
-from rangeseg_ros.simulation.terrain.testpieces import all_pieces
+from rangeseg_ros.simulation.terrain.testpieces import catalogue
 
 CAMERA = Camera(160, 120, 100.0, 100.0, 79.5, 59.5)
 BOX = np.s_[20:60, 20:60]
@@ -147,9 +147,9 @@ def test_pieces_are_detected_by_size_and_distance(run, figures_of, tmp_path):
     assert run(*words, '--output', folder)[0] == 0
     code, figures, out, _ = figures_of(*EVALUATE, folder)
     rows = figures['detection']
-    assert {size for kind, size, _ in all_pieces() if kind == 'ramp'} == {5, 10, 15, 20}
+    assert {size for kind, size, _ in catalogue() if kind == 'ramp'} == {5, 10, 15, 20}
     assert code == 0 and 'test pieces detected' in out
-    assert [(r['kind'], r['size'], r['distance']) for r in rows] == [*all_pieces()]
+    assert [(r['kind'], r['size'], r['distance']) for r in rows] == [*catalogue()]
     for row in rows:
         assert row['ground'] == 0, row
         if row['size'] >= 0.2 and row['scenes']:

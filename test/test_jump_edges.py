@@ -129,7 +129,7 @@ def test_no_link_joins_an_object_and_what_is_behind(detector, heights, shadow, s
         for height, slope in product(heights, (0, 0.0009)):
             image = image_of((ramp(slope) + height * front) * ~dark)
             jumps = jump_edges.jump_edges(image, detector, STEP)
-            assert image.valid[jump_edges.pixels_beside(jumps)].all()
+            assert image.valid[jump_edges.edge_pixels(jumps)].all()
             found = parts([links == 0 for links in grid_of(image, jumps)])
             both = np.intersect1d(found[front], found[~front & ~dark])
             assert not both.size, (angle, height, slope)
@@ -245,4 +245,4 @@ def test_pixels_beside_edges_are_those_on_either_side():
     right, below = np.zeros((3, 4), bool), np.zeros((2, 5), bool)
     right[0, 1] = right[2, 3] = below[0, 4] = below[1, 2] = True
     expected = [[0, 1, 1, 0, 1], [0, 0, 1, 0, 1], [0, 0, 1, 1, 1]]
-    np.testing.assert_array_equal(jump_edges.pixels_beside((right, below)), expected)
+    np.testing.assert_array_equal(jump_edges.edge_pixels((right, below)), expected)

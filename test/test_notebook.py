@@ -34,7 +34,7 @@ def test_one_call_gives_what_the_segmenter_gives(seen, result):
 
 def test_texts_are_short(seen, result):
     sequence = rangeseg_ros.SequenceSegmenter(Config(noise=0.001))
-    parts = result.ground, result.grid, result.survey, result.labelling
+    parts = result.ground, result.grid, result.source, result.labelling
     for thing in (result, result.planes[0], result.image, sequence, sequence.map, *parts):
         assert 10 < len(repr(thing)) < 200
     walls = sum(plane.role == 'wall' for plane in result.planes)

@@ -95,7 +95,7 @@ def test_planes_of_another_frame_are_the_same_planes():
 def test_the_height_counts_where_the_parameter_does_not(parameter, expected):
     image = RangeImage.from_depth(np.ones(CAMERA.shape, np.float32), CAMERA)
     sequence = SequenceSegmenter(Config(sensor_height=parameter))
-    assert sequence.segment(image, 0, UP, height=1.0).survey.sensor_height == expected
+    assert sequence.segment(image, 0, UP, height=1.0).source.sensor_height == expected
     with pytest.raises(ValueError, match='finite'):
         sequence.segment(image, 0, UP, height=np.nan)
 

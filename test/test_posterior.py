@@ -6,8 +6,8 @@ from planes_of_labels import fits_of
 from scipy.ndimage import binary_dilation, convolve, find_objects
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
+from rangeseg_ros.core.by_planes.offsets import local_offsets, offset_at
 from rangeseg_ros.core.by_planes.posterior import _evidence, calibrated, plane_posteriors
-from rangeseg_ros.core.by_planes.shifts import shift_at, shifts
 from rangeseg_ros.core.fitting.region_sums import INVERSE, PLACE, RAY, WEIGHT
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO
 from rangeseg_ros.core.sensing.sensor import SensorModel, distortion_share, random_variance
@@ -155,7 +155,7 @@ def test_what_tells_nothing_has_the_prior():
     np.testing.assert_array_equal(*alone_and_beside(WALL, regions, [1, 2]))
 
 
-def test_shifts_are_the_weighted_residuals_around():
+def test_offsets_are_the_weighted_residuals_around():
     """Of blocks that are not beside another surface."""
     random = np.random.default_rng(3)
     surfaces = np.zeros((11, 13), np.int32)
@@ -168,7 +168,7 @@ def test_shifts_are_the_weighted_residuals_around():
     square = (rays[..., row] * rays[..., column]).sum(axis=2)
     linear = (rays * y[..., None]).sum(axis=2)
     blocks = np.dstack([square, linear, (y**2).sum(axis=2), np.tile([16, 32, 0], (11, 13, 1))])
-    found = shifts(surfaces, blocks, theta, 2, 3, 5.0)
+    found = local_offsets(surfaces, blocks, theta, 2, 3, 5.0)
     for label in (1, 2):
         mine = surfaces == label
         inner = mine & ~binary_dilation((surfaces > 0) & ~mine, np.ones((3, 3)))
@@ -181,7 +181,7 @@ def test_shifts_are_the_weighted_residuals_around():
         near = np.zeros(surfaces.shape, bool)
         near[find_objects(surfaces)[label - 1]] = True
         expected[~binary_dilation(near, np.ones((5, 5)))] = 0
-        values = [shift_at(found, label, *place) for place in np.ndindex(surfaces.shape)]
+        values = [offset_at(found, label, *place) for place in np.ndindex(surfaces.shape)]
         np.testing.assert_allclose(values, expected.ravel(), rtol=1e-4, atol=1e-9)
 
 
@@ -197,5 +197,5 @@ def test_a_crease_stays_in_its_place_where_the_sensor_bends_the_planes():
         image = RangeImage.from_depth((1 / inverse).astype(np.float32), camera)
         edge = (np.diff(Segmenter().segment(image).labels) != 0) & (np.abs(column[:, 1:]) < 0.1)
         away.append(np.where(edge, np.abs(np.arange(639) - 319), 99).min(axis=1))
-    # Without shifts, half.
+    # Without offsets, half.
     assert np.mean(np.array(away) <= 2) > 0.75

@@ -8,9 +8,9 @@ import pytest
 from rangeseg_ros import Camera, Config, RangeImage
 from rangeseg_ros.core.by_planes import labelling as refinement
 from rangeseg_ros.core.by_planes.labelling import refine
+from rangeseg_ros.core.by_planes.offsets import Offsets, offset_at
 from rangeseg_ros.core.by_planes.patches import Nodes, find_patches
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, costs
-from rangeseg_ros.core.by_planes.shifts import Shifts, shift_at
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.graphcut.expansion import GridLabelling, energy, fronts, minimise
 from rangeseg_ros.core.regions import connected_components
@@ -44,7 +44,7 @@ def random_case(seed, height, width, count=3):
     box = np.array([[0, 0, 0, 0]] + count * [[0, 0, -(-height // BLOCK), -(-width // BLOCK)]])
     area = box[:, 2] * box[:, 3]
     shift = random.normal(0, 0.004, area.sum()).astype(np.float32)
-    models = Models(theta, half_precision, Shifts(box, np.cumsum(area) - area, shift))
+    models = Models(theta, half_precision, Offsets(box, np.cumsum(area) - area, shift))
     labels = np.where(image.valid, random.integers(0, count + 1, (height, width)), 0)
     problem = Problem.of(image, SENSOR, edges, LAMBDA)
     # The rays are those of a pinhole camera, whether that is known or not.
@@ -55,7 +55,7 @@ def unary(problem, models):
     """Cost (K + 1, H, W) of every label at every pixel, from the definition."""
     pixels = np.ndindex(len(problem.rays) // problem.width, problem.width)
     blocks, labels = [(i // BLOCK, j // BLOCK) for i, j in pixels], range(len(models.theta))
-    shift = [[shift_at(models.shifts, label, *block) for block in blocks] for label in labels]
+    shift = [[offset_at(models.offsets, label, *block) for block in blocks] for label in labels]
     residual = problem.inverse - (1 + np.array(shift)) * (models.theta @ problem.rays.T)
     cost = np.minimum(residual**2 * problem.weight * models.half_precision[:, None], 8.0)
     cost[0] = 10.8276 / 2  # chi-squared of one degree of freedom, quantile 0.999
@@ -161,7 +161,7 @@ def test_a_label_is_expanded_as_far_as_it_gains():
     labels[:], labels[7, 9] = 2, 1
     gained = linked(problem, 1, labels)
     unknown = np.full(labels.shape, np.nan, np.float32)
-    expand(1, labels, unknown, problem, models._replace(shifts=Shifts.none(4)), reach=2)
+    expand(1, labels, unknown, problem, models._replace(offsets=Offsets.none(4)), reach=2)
     gained[7, 9] = True
     np.testing.assert_array_equal(labels == 1, gained)
 

@@ -108,7 +108,7 @@ def test_ramps_are_ground_as_long_as_they_are_not_steep(degrees, missed):
     floor = Piece(slab(-3, 1.5, 0, 0, ALL), GROUND)
     _, result, frame = found(scene(floor, ramp))
     assert share(result.terrain, frame, GROUND, GROUND) > 0.97
-    planes = with_roles(result.planes, result.survey.config, result.up)
+    planes = with_roles(result.planes, result.source.config, result.up)
     ramps = replace(result, planes=planes).ramps
     assert [ramp.slope for ramp in ramps] == [pytest.approx(9, abs=1)] * (degrees == 9)
     if class_ == OBSTACLE:
@@ -146,7 +146,7 @@ def test_a_pit_is_unseen_in_a_cloud_as_well_and_outlined():
     terrain, count = scene(*gap(1.5, 2.2, *PIT)), []
     image, result, _ = found(terrain)
     cloud = cloud_of(image.points)
-    for seen, of_it in ((image, result), (cloud, Segmenter(result.survey.config).segment(cloud))):
+    for seen, of_it in ((image, result), (cloud, Segmenter(result.source.config).segment(cloud))):
         world = in_the_world(unseen(seen, of_it.ground)[:, :3], terrain)
         inside = (world[:, 0] > 1.45) & (world[:, 0] < 2.3)
         assert np.abs(world[inside, 2]).max() < 0.05

@@ -115,9 +115,9 @@ class SightingsOfPart:
         if shape is None:
             return None
         sightings = concatenate(frames)
-        told = json.dumps(camera and asdict(camera))
+        written = json.dumps(camera and asdict(camera))
         with replacing(path) as partial:
-            np.savez(partial, shape=shape, camera=told, **sightings._asdict())
+            np.savez(partial, shape=shape, camera=written, **sightings._asdict())
         return Seen(sightings, shape, camera)
 
 

@@ -136,8 +136,8 @@ class PlanTask:
         square = sum(plane.exact == 'square' for plane in plan.planes)
         content = f'{len(plan.planes)} planes, {len(plan.walls)} upright, {square} of them square'
         content += f', {len(plan.openings)} openings, {len(plan.stairs)} stairs'
-        told = config.map_frame, up.source, content, warnings
-        return PlanOutcome(frames, len(best.frames), *told)
+        parts = config.map_frame, up.source, content, warnings
+        return PlanOutcome(frames, len(best.frames), *parts)
 
     def _map(
         self, config: Config, progress: Progress | None
@@ -162,7 +162,7 @@ class PlanTask:
                     for s in [] if found.tilt else found.stairs:
                         now.stairs.append((replace(s, edge=s.edge - image.place), len(now.frames)))
                     now.frames.append(k)
-                    now.heights.append(getattr(found.survey, 'sensor_height', 0) or np.nan)
+                    now.heights.append(getattr(found.source, 'sensor_height', 0) or np.nan)
                     now.seen.add(sequence.map.sighting)
                     turn = sequence.pose.rotation
                     now.parameter_up += turn @ (config.up_x, config.up_y, config.up_z)

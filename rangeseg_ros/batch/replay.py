@@ -249,7 +249,7 @@ def segment_frames(
             at = place(frame, sequence.motion)
             result = sequence.segment(image, frame.stamp, at.up, at.pose, at.height, at.up_sd)
             if at.lost:
-                result = replace(result, survey=None)
+                result = replace(result, source=None)
             yield done + source.lost.total(), frame, image, result
             done += 1
     except DamagedBagError as error:

@@ -92,6 +92,6 @@ def main() -> None:
             sys.exit(130)
         if not isinstance(error, _EXPECTED):
             raise
-        told = error.format_message() if isinstance(error, click.ClickException) else None
-        print(f'rangeseg: {told or one_line(error)}', file=sys.stderr)
+        usage = error.format_message() if isinstance(error, click.ClickException) else None
+        print(f'rangeseg: {usage or one_line(error)}', file=sys.stderr)
         sys.exit(2)

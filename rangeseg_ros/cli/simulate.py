@@ -25,7 +25,7 @@ from rangeseg_ros.simulation.sensors.sensor import Sensor, resize
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
 from rangeseg_ros.simulation.terrain.kinds import HARD, KINDS, stated, terrain_scene
 from rangeseg_ros.simulation.terrain.scene import Terrain
-from rangeseg_ros.simulation.terrain.testpieces import all_pieces, piece_scene
+from rangeseg_ros.simulation.terrain.testpieces import catalogue, piece_scene
 
 _PLANES = 'image', 'label', 'face', 'normal_x', 'normal_y', 'normal_z', 'distance', 'count'
 SCENES: dict[str, Callable[[int, int], Scene]] = {'room': kinect_room, 'curved': curved_scene}
@@ -37,7 +37,7 @@ _sensor = options.choice(
     'Structured light, active stereo, time of flight of a phone, lidar of a tablet, or a sensor '
     'without error.',
 )
-_of_all_sets = options.together(
+_common_options = options.together(
     options.number('--seed', default=0, help='Of the first scene; each further one adds 1.'),
     click.option('--width', type=_size, help="Columns; the sensor's own."),
     click.option('--height', type=_size, help="Rows; the sensor's own."),
@@ -48,7 +48,7 @@ _of_rooms = options.together(
     options.number('--sensor-seed', default=0, help='Which one of its kind the sensor is.'),
     options.count('--scenes', default=12, help='How many.'),
     options.count('--frames', default=1, help='Of each scene, at 30 Hz from a hand that moves.'),
-    _of_all_sets,
+    _common_options,
 )
 
 
@@ -138,7 +138,7 @@ def _write_rooms(
 @click.option('--kind', type=click.Choice([*KINDS, *HARD]), help='Only scenes of this kind.')
 @click.option('--hard', is_flag=True, help='Scenes that are easily confused, of all such kinds.')
 @options.count('--scenes', default=len(KINDS), help='How many; the kinds take turns.')
-@_of_all_sets
+@_common_options
 def terrain(
     sensor: str, kind: str | None, hard: bool, scenes: int, seed: int, **given: Any
 ) -> None:
@@ -174,7 +174,7 @@ def terrain(
     show_default=True,
     help='Height of the camera above the ground, metres; it is aimed 1.5 m ahead.',
 )
-@_of_all_sets
+@_common_options
 def testpieces(sensor: str, scenes: int, mount: float, seed: int, **given: Any) -> None:
     """Cylinders, boxes, kerbs, edges, gaps and ramps of known size at known distances.
 
@@ -182,7 +182,7 @@ def testpieces(sensor: str, scenes: int, mount: float, seed: int, **given: Any) 
     are detected.
     """
     numbers = range(seed, seed + scenes)
-    made = [piece_scene(*piece, mount, number) for piece in all_pieces() for number in numbers]
+    made = [piece_scene(*piece, mount, number) for piece in catalogue() for number in numbers]
     _write_terrains(made, sensor, seed, **given)
 
 

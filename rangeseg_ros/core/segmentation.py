@@ -16,14 +16,14 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.description.tilt import Tilt, tilt_of
 from rangeseg_ros.core.ground.grid import GroundGrid
+from rangeseg_ros.core.ground.ground_input import GroundInput
 from rangeseg_ros.core.ground.roles import Ramp, ramps_of
 from rangeseg_ros.core.ground.stairs import Stairs, stairs_of
-from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.ground.terrain import Terrain
 from rangeseg_ros.core.regions import region_sizes
 from rangeseg_ros.core.sensing.enlargement import Cells
 from rangeseg_ros.core.sensing.grid import GridEdges
-from rangeseg_ros.core.sensing.jump_edges import pixels_beside
+from rangeseg_ros.core.sensing.jump_edges import edge_pixels
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sensing.verdict import Verdict, judge, no_depth
@@ -80,7 +80,7 @@ class Segmentation:
         What the regions were made from.
     jumps : (horizontal, vertical) of bool or None
         Edges of the grid of `cells` that cross a jump; None where none were looked for.
-    survey : Survey or Terrain
+    source : GroundInput or Terrain
         How the ground is found, or what was found.
     upright : tuple of 3 float
         Tolerance, smallest area and slope of `tilt_of`.
@@ -105,7 +105,7 @@ class Segmentation:
     sensor: SensorModel = STATED
     labelling: Labelling = field(default=StoredLabelling(0.0, None), repr=False)
     jumps: GridEdges | None = field(default=None, repr=False)
-    survey: Survey | Terrain | None = field(default=None, repr=False)
+    source: GroundInput | Terrain | None = field(default=None, repr=False)
     upright: tuple[float, float, float] | None = None
     work_budget: float = 1.0
     image: RangeImage | None = None
@@ -198,9 +198,9 @@ class Segmentation:
     @cached_property
     def tilt(self) -> Tilt | None:
         """Where the planes say that up is, when that is not what was stated; when read."""
-        if self.upright is None or not isinstance(self.survey, Survey):
+        if self.upright is None or not isinstance(self.source, GroundInput):
             return None
-        return tilt_of(self.planes, self.survey.up, *self.upright)
+        return tilt_of(self.planes, self.source.up, *self.upright)
 
     @cached_property
     def normals(self) -> Singles:
@@ -224,7 +224,7 @@ class Segmentation:
         """(H, W) True on either side of a jump edge, worked out when read."""
         if self.jumps is None:
             return np.zeros(self.labels.shape, np.bool_)
-        return self._at_full_size(pixels_beside(self.jumps))
+        return self._at_full_size(edge_pixels(self.jumps))
 
     @cached_property
     def ground(self) -> Terrain | None:
@@ -232,31 +232,31 @@ class Segmentation:
 
         None where none was asked for, or the image is no depth in metres.
         """
-        if not isinstance(self.survey, Survey):
-            return self.survey
-        return None if no_depth(self.survey.image) else self.survey.terrain()
+        if not isinstance(self.source, GroundInput):
+            return self.source
+        return None if no_depth(self.source.image) else self.source.terrain()
 
     @cached_property
     def grid(self) -> GroundGrid | None:
         """The ground around the robot, of this image and earlier ones whose `grid` was read."""
-        if not isinstance(self.survey, Survey) or self.ground is None:
+        if not isinstance(self.source, GroundInput) or self.ground is None:
             return None
-        return self.survey.ground_grid(self.ground)
+        return self.source.ground_grid(self.ground)
 
     @cached_property
     def stairs(self) -> list[Stairs]:
         """Staircases in sight, up and down, worked out when read."""
-        if not isinstance(self.survey, Survey) or self.ground is None:
+        if not isinstance(self.source, GroundInput) or self.ground is None:
             return []
-        place = self.survey.image.place
+        place = self.source.image.place
         return [replace(seen, edge=seen.edge + place) for seen in stairs_of(self.ground)]
 
     @property
     def up(self) -> Floats | None:
         """(3,) unit vector in the frame of the image; None where no ground was asked for."""
-        if self.survey is None:
+        if self.source is None:
             return None
-        return self.survey.up if isinstance(self.survey, Survey) else self.survey.field.up
+        return self.source.up if isinstance(self.source, GroundInput) else self.source.field.up
 
     @property
     def ramps(self) -> list[Ramp]:
@@ -289,6 +289,6 @@ class Segmentation:
             **self.__dict__,
             **kept,
             'labelling': labelling,
-            'survey': self.ground,
+            'source': self.ground,
             'image': None,
         }

@@ -19,7 +19,7 @@ from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.noise import measured_sensor, nested, quantisation
 from rangeseg_ros.core.fitting.region_sums import sum_regions
 from rangeseg_ros.core.fitting.steps import jump_steps
-from rangeseg_ros.core.ground.survey import Survey
+from rangeseg_ros.core.ground.ground_input import GroundInput
 from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.regions import least_pixels, numbers_of, plane_regions, relabel
 from rangeseg_ros.core.runtime.kernels import with_kernels
@@ -100,7 +100,7 @@ class Segmenter:
             result = self._segment_cells(depth, enlargement(depth))
             # Heights in no unit are no ground to drive on.
             return replace(
-                result, image=image, values='picture' if q else 'disparity', survey=None
+                result, image=image, values='picture' if q else 'disparity', source=None
             )
         return self._segment_cells(image, enlargement(image), begun)
 
@@ -111,13 +111,13 @@ class Segmenter:
         config = self.config
         if cells is None:
             result = self._find_planes(image, begun)
-            return replace(result, survey=Survey.of(image, result.sensor, config))
+            return replace(result, source=GroundInput.of(image, result.sensor, config))
         result = self._find_planes(cells.reduced(image))
-        survey = replace(Survey.of(image, result.sensor, config), cells=cells)
+        source = replace(GroundInput.of(image, result.sensor, config), cells=cells)
         labels = cells.enlarged(result.labels, image.shape) * image.valid
         squares = cells._replace(factor=cells.factor * result.side)
         sensor = result.sensor.rescaled(1 / cells.factor)
-        return replace(result.of_pixels(labels, image, squares), survey=survey, sensor=sensor)
+        return replace(result.of_pixels(labels, image, squares), source=source, sensor=sensor)
 
     def _side(self, image: RangeImage) -> int:
         """Pixels along the side of a bin: directions are told from pixels."""

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.grid import GroundMemory
+from rangeseg_ros.core.ground.ground_input import GroundInput
 from rangeseg_ros.core.ground.roles import roles, unit
-from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.mapping.edges import JumpPoints
 from rangeseg_ros.core.mapping.map_planes import moved_planes
 from rangeseg_ros.core.mapping.observations import views
@@ -154,14 +154,14 @@ class SequenceSegmenter:
         self.pose = pose.after(sensor.inverse()) if pose else None
         if pose:
             self.map.add(result.labels, planes, image, pose, stamp)
-        survey = result.survey
-        if isinstance(survey, Survey) and up is not None:
+        source = result.source
+        if isinstance(source, GroundInput) and up is not None:
             above = 0.0 if height is None else max(0.0, float(height + up @ image.place))
-            survey = replace(
-                survey,
+            source = replace(
+                source,
                 config=config,
                 up=up,
-                sensor_height=survey.sensor_height or above,
+                sensor_height=source.sensor_height or above,
                 memory=self._ground,
                 stamp=stamp,
                 pose=pose,
@@ -171,7 +171,7 @@ class SequenceSegmenter:
             plane.named(id=seen.id, surface=seen.surface, role=seen.role)
             for plane, seen in zip(result.planes, planes, strict=True)
         ]
-        return replace(result, planes=planes, survey=survey)
+        return replace(result, planes=planes, source=source)
 
 
 def with_roles(

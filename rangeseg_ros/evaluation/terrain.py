@@ -211,10 +211,10 @@ def _reliability(images: Sequence[Shares]) -> list[dict[str, float]]:
     """Of images by their confidence, how often the ground seen is the robot's own."""
     rows = []
     for low, high in pairwise(CONFIDENCES):
-        told = np.array([(i.confidence, i.own) for i in images if low <= i.confidence < high])
-        if len(told):
-            mean, right = told.mean(axis=0).tolist()
-            rows.append({'from': low, 'images': len(told), 'confidence': mean, 'right': right})
+        stated = np.array([(i.confidence, i.own) for i in images if low <= i.confidence < high])
+        if len(stated):
+            mean, right = stated.mean(axis=0).tolist()
+            rows.append({'from': low, 'images': len(stated), 'confidence': mean, 'right': right})
     return rows
 
 
@@ -239,11 +239,11 @@ def terrain_table(figures: Mapping[str, Any]) -> str:
     for kind, row in {**figures['by_kind'], 'all': figures['pooled']}.items():
         lines.append(f'{kind:<18}' + ''.join(f'{_share(value):>9}' for value in row.values()))
     lines.append(f'drop called ground above 0.01: {len(figures["drop_scenes_above_0.01"])} scenes')
-    told = (
+    rates = (
         f'{row["confidence"]:.3f}: {row["right"]:.3f} of {row["images"]}'
         for row in figures['reliability']
     )
-    lines.append(f'confidence in the ground, and how often it was right: {", ".join(told)}')
+    lines.append(f'confidence in the ground, and how often it was right: {", ".join(rates)}')
     lines.append('obstacles found, from this height (m) on, at 0, 1, 2, 3 m:')
     for least, row in figures['by_size'].items():
         lines.append(f'{least:<18}' + ''.join(f'{_share(value):>9}' for value in row.values()))

@@ -45,8 +45,8 @@ def read_params(path: Path) -> dict[str, Any]:
         own = _without_node_only(section)
         foreign = [name for name in own if node != NODE and name not in NAMES]
         if foreign:
-            told = ', '.join(sorted(unknown_parameter(name, NAMES) for name in foreign))
-            warnings.warn(f'{path}: {told} (of another node?), ignored', stacklevel=2)
+            listed = ', '.join(sorted(unknown_parameter(name, NAMES) for name in foreign))
+            warnings.warn(f'{path}: {listed} (of another node?), ignored', stacklevel=2)
         merged.update({name: value for name, value in own.items() if name not in foreign})
     return merged
 

@@ -14,7 +14,7 @@ from rangeseg_ros.core.arrays import Singles
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground import points
 from rangeseg_ros.core.ground.cells import GROUND, OBSTACLE
-from rangeseg_ros.core.ground.survey import Survey
+from rangeseg_ros.core.ground.ground_input import GroundInput
 from rangeseg_ros.core.ground.terrain import Terrain
 from rangeseg_ros.core.mapping.map_planes import moved_planes
 from rangeseg_ros.core.mapping.transforms import Transform
@@ -60,7 +60,8 @@ def _points(
     def pick(image: RangeImage, result: Segmentation) -> Singles:
         if result.ground is None:
             return np.zeros((0, 4), np.float32)
-        size = result.survey.config.cloud_resolution if isinstance(result.survey, Survey) else 0.0
+        source = result.source
+        size = source.config.cloud_resolution if isinstance(source, GroundInput) else 0.0
         return clouds.thinned(find(image, result.ground), size, most)
 
     return Output(CLOUD, clouds.points_message, pick)

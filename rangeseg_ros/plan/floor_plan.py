@@ -198,8 +198,8 @@ def make_plan(
     openings = [o for wall in walls for o in _openings(wall, cells, grid)]
     x, y = (grid.first * resolution).tolist()
     seen = [(each, motion.after(pose)) for each, pose in stairs]
-    told = frame, motion, up, ground, squared, walls, openings, flights(seen)
-    return FloorPlan(*told, cells, (x, y), resolution)
+    parts = frame, motion, up, ground, squared, walls, openings, flights(seen)
+    return FloorPlan(*parts, cells, (x, y), resolution)
 
 
 def _upright(up: PlanUp) -> Transform:
@@ -214,11 +214,11 @@ def _upright(up: PlanUp) -> Transform:
     return Transform(turn, np.zeros(3))
 
 
-def _roles(planes: Sequence[MapPlane], told: Floats, config: Config) -> tuple[list[str], float]:
+def _roles(planes: Sequence[MapPlane], stated: Floats, config: Config) -> tuple[list[str], float]:
     """Roles of planes in a frame whose z is up, and the height of the ground.
 
-    The ground is the large plane that faces up and is nearest to its heights as told (F,), or else
-    the lowest; without one, the lowest point that was seen.
+    The ground is the large plane that faces up and is nearest to the stated heights (F,), or the
+    lowest; without one, the lowest point that was seen.
     """
     tolerance = np.radians(config.role_tolerance)
     tilt = np.array([plane.normal[2] for plane in planes])
@@ -226,9 +226,9 @@ def _roles(planes: Sequence[MapPlane], told: Floats, config: Config) -> tuple[li
     large = np.array([plane.area >= config.role_area for plane in planes], np.bool_)
     facing_up, facing_down = tilt > np.cos(tolerance), tilt < -np.cos(tolerance)
     lowest = [ring[:, 2].min() for plane in planes for ring in plane.outline.rings]
-    level, told = height[facing_up & large], told[np.isfinite(told)]
+    level, stated = height[facing_up & large], stated[np.isfinite(stated)]
     ground = float(min(level.tolist() or lowest or [0.0]))
-    off = np.abs(level - np.median(told)) if len(told) else np.full(len(level), np.inf)
+    off = np.abs(level - np.median(stated)) if len(stated) else np.full(len(level), np.inf)
     if off.min(initial=np.inf) <= config.role_height:
         ground = float(level[off.argmin()])
     top = height[facing_down & large].max(initial=-np.inf)

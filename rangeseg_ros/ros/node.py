@@ -128,8 +128,8 @@ class SegmentPlanes(LifecycleNode):
             answer: ChangeState.Response = self._change_state(request, response)
             return answer
         except RuntimeError:
-            told = f'transition {request.transition.id} is not possible in this state'
-            self.get_logger().warning(told)
+            refusal = f'transition {request.transition.id} is not possible in this state'
+            self.get_logger().warning(refusal)
             response.success = False
             return response
 

@@ -174,7 +174,7 @@ class Pipeline:
             lost = f'no terrain: {found.tilt}'
         self._statistics.no_terrain = lost
         if lost:
-            found = replace(found, survey=None)
+            found = replace(found, source=None)
             self._node.get_logger().warning(lost, throttle_duration_sec=5.0)
         self._tell(sequence, at)
         segmented.ticks.append(time.perf_counter())

@@ -132,7 +132,7 @@ def prism(outline: ArrayLike, height: float, rotation: ArrayLike, centre: ArrayL
     edges = np.roll(corners, -1, axis=0) - corners
     x, y = edges[:, ::-1].T * ([[1], [-1]] / np.linalg.norm(edges, axis=1))
     upright = np.column_stack([x, y, np.zeros(len(x)), -(x * corners[:, 0] + y * corners[:, 1])])
-    return _placed(_flat(np.vstack([upright, _ends(height)])), rotation, centre)
+    return _placed(_flat(np.vstack([upright, _caps(height)])), rotation, centre)
 
 
 def box(size: ArrayLike, rotation: ArrayLike, centre: ArrayLike) -> Solid:
@@ -149,7 +149,7 @@ def sphere(radius: float, centre: ArrayLike) -> Solid:
 def cylinder(radius: float, height: float, rotation: ArrayLike, centre: ArrayLike) -> Solid:
     """Cylinder along its own z axis, with flat ends."""
     round_ = np.diag([1.0, 1.0, 0.0, -(radius**2)])
-    faces = np.concatenate([_flat(_ends(height)).faces, round_[None]])
+    faces = np.concatenate([_flat(_caps(height)).faces, round_[None]])
     return _placed(Solid(faces), rotation, centre)
 
 
@@ -159,7 +159,7 @@ def about_z(degrees: float) -> Floats:
     return rotation
 
 
-def _ends(height: float) -> Floats:
+def _caps(height: float) -> Floats:
     """Top and bottom, (2, 4), of a solid of that height about its origin."""
     return np.array([[0, 0, 1, -height / 2], [0, 0, -1, -height / 2]])
 

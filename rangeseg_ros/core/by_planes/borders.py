@@ -10,8 +10,8 @@ import numpy as np
 from numba import njit
 
 from rangeseg_ros.core.arrays import Ints, Labels, Singles
+from rangeseg_ros.core.by_planes.offsets import offset_at
 from rangeseg_ros.core.by_planes.plane_energy import CAP, NO_PLANE, Models
-from rangeseg_ros.core.by_planes.shifts import shift_at
 from rangeseg_ros.core.sensing.blocks import NODE
 from rangeseg_ros.core.sensing.moments import ray_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -79,7 +79,7 @@ def _with_sharp_borders(
                     names[c], count = regions[u, v], count + 1
                     label = int(np.intp(surfaces[u, v])) if regions[u, v] > 0 else 0
                     planes[c] = label
-                    nearer[c] = 1 + shift_at(models.shifts, label, i // NODE, j // NODE)
+                    nearer[c] = 1 + offset_at(models.offsets, label, i // NODE, j // NODE)
             for u in range(i * side, min((i + 1) * side, height)):
                 for v in range(j * side, min((j + 1) * side, width)):
                     if inverse[u, v] == 0:

@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 
 from rangeseg_ros.core.arrays import Floats, Ints, Singles
+from rangeseg_ros.core.by_planes.offsets import local_offsets
 from rangeseg_ros.core.by_planes.plane_energy import (
     LEAST_GAIN,
     NO_PLANE,
@@ -13,7 +14,6 @@ from rangeseg_ros.core.by_planes.plane_energy import (
     Problem,
     data_cost,
 )
-from rangeseg_ros.core.by_planes.shifts import shifts
 from rangeseg_ros.core.graphcut.expansion import GridLabelling, band, beyond, expand, fronts
 from rangeseg_ros.core.runtime.threads import map_halves, run_halves
 from rangeseg_ros.core.sensing.blocks import NODE
@@ -21,7 +21,7 @@ from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # Pixels by which a label may expand at once: borders of blocks are off by up to a block.
 _BAND = NODE
-# Blocks around a surface where shifts of its plane are computed as well.
+# Blocks around a surface where offsets of its plane are computed as well.
 _MARGIN = 4
 
 
@@ -34,10 +34,10 @@ def refine(
     the errors of the image.
     """
     models = Models.of(moments, sensor.distortion_pixels)
-    # Shifts are means over windows as wide as the distortion, within which it hardly changes.
+    # Offsets are means over windows as wide as the distortion, within which it hardly changes.
     around = int(sensor.distortion_length / NODE - 1) // 2
-    local = shifts(surfaces, blocks, models.theta, _MARGIN, around, sensor.block_inflation)
-    models = models._replace(shifts=local)
+    local = local_offsets(surfaces, blocks, models.theta, _MARGIN, around, sensor.block_inflation)
+    models = models._replace(offsets=local)
     labels = np.empty(len(problem.inverse), np.int32)
     # What labels cost is worked out where it is asked for.
     data = np.full(len(labels), np.nan, np.float32)

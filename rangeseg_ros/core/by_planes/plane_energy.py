@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from rangeseg_ros.core.arrays import Floats, Ints, Singles
-from rangeseg_ros.core.by_planes.shifts import Shifts, shift_at
+from rangeseg_ros.core.by_planes.offsets import Offsets, offset_at
 from rangeseg_ros.core.graphcut.expansion import link_costs
 from rangeseg_ros.core.sensing.blocks import NODE
 from rangeseg_ros.core.sensing.grid import Grid
@@ -66,23 +66,23 @@ class Models(NamedTuple):
     """The planes theta . ray = inverse range (K + 1, 3) that are labels; entry 0 is no plane.
 
     `half_precision` (K + 1,) is half of the random variance over that which is granted: what a
-    squared residual in random variances costs. `shifts`: how much nearer they look at each block.
+    squared residual in random variances costs. `offsets`: how much nearer they look at each block.
     """
 
     theta: Floats
     half_precision: Floats
-    shifts: Shifts
+    offsets: Offsets
 
     @classmethod
     def of(cls, moments: Floats, smooth: float) -> Models:
-        """Planes of moment vectors (K + 1, 13), as yet without shifts.
+        """Planes of moment vectors (K + 1, 13), as yet without offsets.
 
         Regions of `smooth` pixels meet half the variance of the distortion.
         """
         theta, _ = fit_all(moments)
         count = np.maximum(moments[:, COUNT], 1)
         granted = (1 + moments[:, SLOPE] / count) * (1 + moments[:, RATIO] / (count + smooth))
-        return cls(theta, 0.5 / granted, Shifts.none(len(theta)))
+        return cls(theta, 0.5 / granted, Offsets.none(len(theta)))
 
 
 @njit(cache=True)
@@ -102,7 +102,7 @@ def data_cost(label: int, p: int, problem: Problem, models: Models) -> float:
     theta, rays = models.theta, problem.rays
     level = theta[label, 0] * rays[first, 0] + theta[label, 1] * rays[second, 1]
     level += theta[label, 2] * rays[first, 2]
-    residual = problem.inverse[p] - (1 + shift_at(models.shifts, label, row, column)) * level
+    residual = problem.inverse[p] - (1 + offset_at(models.offsets, label, row, column)) * level
     return min(models.half_precision[label] * problem.weight[p] * residual * residual, CAP)
 
 

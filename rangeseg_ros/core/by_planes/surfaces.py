@@ -110,7 +110,7 @@ def _agglomerate(
     # from one surface, 1 being too far; one more than there are, as there may be none.
     strips, apart = np.zeros((2 * len(length), SIZE)), np.full(len(length) + 1, np.inf)
     for e in range(len(length)):
-        a, b = _ends(target, e)
+        a, b = _parts(target, e)
         for h in range(2 * e, 2 * e + 2):
             part = target[h ^ 1]
             # The side of a square patch borders on one other, or on several in part.
@@ -122,7 +122,7 @@ def _agglomerate(
         e = int(apart.argmin())
         if not apart[e] < 1:
             break
-        a, b = _ends(target, e)
+        a, b = _parts(target, e)
         residual[a] = common_residual(moments, a, b)
         parent[b] = a
         for k in range(SIZE):
@@ -137,7 +137,7 @@ def _agglomerate(
 
 
 @njit(cache=True)
-def _ends(target: Ints, e: int) -> tuple[int, int]:
+def _parts(target: Ints, e: int) -> tuple[int, int]:
     """The parts of a contact, the earlier one first."""
     one, other = int(np.intp(target[2 * e])), int(np.intp(target[2 * e + 1]))
     return min(one, other), max(one, other)

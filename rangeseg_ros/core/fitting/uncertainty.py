@@ -111,9 +111,9 @@ def _halves(
                 ray[i, p] = np.sqrt(own) * cell[RAY + p]
             # The part of the field that varies within the cell.
             total = (variance + 2 * place[i, 2]) * (variance + 2 * place[i, 3])
-            alike = max(cell[COUNT] * variance / np.sqrt(max(total, 1e-300)), 1.0)
+            shared = max(cell[COUNT] * variance / np.sqrt(max(total, 1e-300)), 1.0)
             spread = (place[i, 2] + place[i, 3]) / 2
-            own *= spread / max(variance + spread, 1e-300) * alike * cell[WEIGHT] / cell[COUNT]
+            own *= spread / max(variance + spread, 1e-300) * shared * cell[WEIGHT] / cell[COUNT]
             for entry in range(6):
                 p, q = ROWS[entry], COLUMNS[entry]
                 centred = cell[entry] - cell[RAY + p] * cell[RAY + q] / cell[WEIGHT]
@@ -127,12 +127,12 @@ def _halves(
                 lag += (place[i, 1] - place[j, 1]) ** 2 / max(across, 1e-300)
                 if lag > _FAR**2:
                     continue
-                alike = variance / np.sqrt(max(down * across, 1e-300)) * np.exp(-lag / 2)
+                shared = variance / np.sqrt(max(down * across, 1e-300)) * np.exp(-lag / 2)
                 if lag == 0:
                     # A pixel agrees with itself.
-                    alike = max(alike, 1 / min(sums.cells[i, COUNT], sums.cells[j, COUNT]))
-                alike /= 1 + (i == j)
-                x, y, z = x + alike * ray[j, 0], y + alike * ray[j, 1], z + alike * ray[j, 2]
+                    shared = max(shared, 1 / min(sums.cells[i, COUNT], sums.cells[j, COUNT]))
+                shared /= 1 + (i == j)
+                x, y, z = x + shared * ray[j, 0], y + shared * ray[j, 1], z + shared * ray[j, 2]
             for p in range(3):
                 result[k, p, 0] += ray[i, p] * x
                 result[k, p, 1] += ray[i, p] * y

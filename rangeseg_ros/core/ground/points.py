@@ -30,12 +30,12 @@ def points_of_class(image: RangeImage, terrain: Terrain, kind: int) -> Singles:
 
 
 def drops(image: RangeImage, terrain: Terrain) -> Singles:
-    """Where the rays that end in a drop cross the ground continued, as `_crossings`."""
-    return _crossings(image.rays, image, terrain, terrain.classes == DROP)
+    """Where the rays that end in a drop cross the ground continued, as `_ground_points`."""
+    return _ground_points(image.rays, image, terrain, terrain.classes == DROP)
 
 
 def unseen(image: RangeImage, terrain: Terrain) -> Singles:
-    """Crossings of rays without a measurement, as `_crossings`.
+    """Crossings of rays without a measurement, as `_ground_points`.
 
     Points lie within the least and greatest range at which measured pixels are ground or unknown,
     as sensors have a nearest and a farthest range. Pixels of the robot's body do not count, nor do
@@ -55,10 +55,10 @@ def unseen(image: RangeImage, terrain: Terrain) -> Singles:
             opened[~completed[1]] = 0
     if not len(seen):
         return np.zeros((0, 4), np.float32)
-    return _crossings(rays, image, terrain, opened > 0, (float(seen.min()), float(seen.max())))
+    return _ground_points(rays, image, terrain, opened > 0, (float(seen.min()), float(seen.max())))
 
 
-def _crossings(
+def _ground_points(
     rays: Singles,
     image: RangeImage,
     terrain: Terrain,

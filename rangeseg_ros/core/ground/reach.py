@@ -18,7 +18,7 @@ from rangeseg_ros.core.runtime.threads import Task
 from rangeseg_ros.core.significance import CLEARLY, OUTLIER
 
 # Columns on either side whose ground leads to a cell.
-_BESIDE = 4
+_NEIGHBOURS = 4
 # Cells, as powers of two, over which a slope is measured along rows and columns.
 _BASELINES = 6
 
@@ -130,7 +130,7 @@ def _spread(
             else:
                 total = summed = 0.0
                 nearest = np.inf
-                for q in range(max(c - _BESIDE, 0), min(c + _BESIDE + 1, columns)):
+                for q in range(max(c - _NEIGHBOURS, 0), min(c + _NEIGHBOURS + 1, columns)):
                     square = (last[q, 1] - x) ** 2 + (last[q, 2] - y) ** 2
                     if square <= radius * radius:
                         nearest = min(nearest, square)

@@ -137,8 +137,8 @@ def _upright(
         # Without a height the ground is what the camera stands on: a table tells by its size.
         size = float(np.ptp(place[1:, reached], axis=1).max()) if seen else 0.0
         sure = size >= FURNITURE
-        told = f'the {size:.2f} m of level surface in view may be a table: state sensor_height'
-        reason = told if size > config.least_step else ''
+        why = f'the {size:.2f} m of level surface in view may be a table: state sensor_height'
+        reason = why if size > config.least_step else ''
     if seen is None or not sure:
         confidence = seen.confidence if seen and height_sd > 0 else 0.0
         stand = Stand(np.zeros(3), confidence, (reason,) if reason else ())
@@ -182,11 +182,11 @@ def _with_ground(
     noise = np.float32(_CERTAIN) * np.sqrt(cells.error**2 + relief)
     # Among cells that a chain leads to, noise keeps some out of it.
     closed = cv2.morphologyEx(reached.view(np.uint8), cv2.MORPH_CLOSE, _AROUND)
-    reached, beside = closed > 0, cv2.dilate(closed, np.ones((3, 3), np.uint8)) > 0
+    reached, border = closed > 0, cv2.dilate(closed, np.ones((3, 3), np.uint8)) > 0
     # Where no chain leads, half as much is no ground.
     share = np.where(reached, np.float32(1), np.float32(0.5))
     least = np.float32(config.least_step / 4)
-    near = np.where(reached, np.clip(noise, least, config.least_step), np.where(beside, least, -1))
+    near = np.where(reached, np.clip(noise, least, config.least_step), np.where(border, least, -1))
     lowest = -np.maximum(share * config.drop_height, sure)
     highest = np.maximum(share * config.obstacle_height, sure)
     bounds = np.stack([near, lowest, highest], dtype=np.float32)

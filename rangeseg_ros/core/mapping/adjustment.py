@@ -57,7 +57,7 @@ class Solution(NamedTuple):
     """Planes, with outlines on them, and poses of the frames as they were most probably.
 
     `covariance` (4 P, 4 P) is of normal and distance of all planes in turn. `drift` (3,) is of the
-    poses as they were told, metres per metre of the `way` of the camera, metres; where it is more
+    poses as they were given, metres per metre of the `way` of the camera, metres; where it is more
     than chance makes it (chi-squared, 0.999), the camera `drifts`, and it is taken off. `field`
     (C,), 1/m, is the distortion in the cells of the image.
     """
@@ -92,7 +92,7 @@ class Solution(NamedTuple):
 class Adjustment:
     """Collects what the frames of a recording show of the planes of its map.
 
-    `noise` is that of the poses that are told or, where their errors add up as those of an
+    `noise` is that of the poses that are given or, where their errors add up as those of an
     odometry do, of their changes from frame to frame.
     """
 
@@ -157,14 +157,14 @@ class Adjustment:
         sizes = np.asarray(field.power(2).sum(axis=1)).reshape(-1, 3).mean(axis=1)
         size = max(float(np.median(sizes)), 1.0) if len(sizes) else 1.0
         precision = np.repeat([1.0, size], [own.shape[1], field.shape[1]]) / LASTING
-        told = _State(PlaneSet.of(planes), *map(np.array, zip(*self._poses, strict=True)))
+        given = _State(PlaneSet.of(planes), *map(np.array, zip(*self._poses, strict=True)))
         sightings = _Measurements(frame[used], plane[used], seen, root, lasting, precision)
-        state, rest, covariance = self._solved(told, sightings, drifts=not self._odometry)
+        state, rest, covariance = self._solved(given, sightings, drifts=not self._odometry)
         drift = rest[-3:]
         drift_covariance = covariance[-3:, -3:]
         drifts = drift @ np.linalg.solve(drift_covariance, drift) > chi2_quantile(3)
         if not drifts:
-            state, rest, covariance = self._solved(told, sightings, drifts=False)
+            state, rest, covariance = self._solved(given, sightings, drifts=False)
         jacobian = block_diag(*from_errors(state.planes.axes, state.planes.point))
         joint = jacobian @ covariance[:-3, :-3] @ jacobian.T
         return Solution(
@@ -179,16 +179,16 @@ class Adjustment:
         )
 
     def _solved(
-        self, told: _State, sightings: _Measurements, drifts: bool
+        self, given: _State, sightings: _Measurements, drifts: bool
     ) -> tuple[_State, Floats, Floats]:
         """The most probable state and all else, and the covariance of all planes and the drift."""
         # What lasts, what jumps were taken for wrongly, and the drift.
-        state, rest = told, np.zeros(sightings.lasting.shape[1] + 6 * len(self._jumps) + 3)
-        first, last = 3 * len(told.planes.normal), 3 * len(told.planes.normal) + 6 * len(told.turn)
+        state, rest = given, np.zeros(sightings.lasting.shape[1] + 6 * len(self._jumps) + 3)
+        first, last = np.cumsum([3 * len(given.planes.normal), 6 * len(given.turn)]).tolist()
         prior = self._prior(first, sightings.precision, drifts)
         for _ in range(_ROUNDS):
             design, gap = state.equations(sightings, rest)
-            known = np.concatenate([np.zeros(first), state.pose_errors(told), rest])
+            known = np.concatenate([np.zeros(first), state.pose_errors(given), rest])
             # Cauchy's weights: things that move by themselves are not to move the camera.
             scale = np.repeat(1 / np.sqrt(1 + (gap.reshape(-1, 3) ** 2).sum(axis=1) / GATE), 3)
             rows = sparse.vstack([sparse.diags(scale) @ design, prior]).tocsr()
@@ -269,10 +269,10 @@ class _State(NamedTuple):
     turn: Floats
     shift: Floats
 
-    def pose_errors(self, told: _State) -> Floats:
-        """(6 F,) what poses that were told err by."""
-        turn = Rotation.from_matrix(told.turn @ self.turn.transpose(0, 2, 1)).as_rotvec()
-        return np.column_stack([turn, told.shift - self.shift]).ravel()
+    def pose_errors(self, given: _State) -> Floats:
+        """(6 F,) what poses that were given err by."""
+        turn = Rotation.from_matrix(given.turn @ self.turn.transpose(0, 2, 1)).as_rotvec()
+        return np.column_stack([turn, given.shift - self.shift]).ravel()
 
     def corrected(self, planes: Floats, poses: Floats) -> _State:
         """Without these errors, (3 P,) and (6 F,)."""

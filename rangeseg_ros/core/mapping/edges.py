@@ -88,9 +88,9 @@ class JumpPoints(NamedTuple):
             known = gap**2 < _GATE * expected
             weight *= known / (_CORRELATED * deviation**2)
             scale, axes = np.linalg.eigh((slope * weight[:, None]).T @ slope)
-            told = scale > 1e-9 * scale[-1]
-            design = np.sqrt(scale[told])[:, None] * axes.T[told]
-            values = (axes.T[told] @ (slope.T @ (weight * gap))) / np.sqrt(scale[told])
+            large = scale > 1e-9 * scale[-1]
+            design = np.sqrt(scale[large])[:, None] * axes.T[large]
+            values = (axes.T[large] @ (slope.T @ (weight * gap))) / np.sqrt(scale[large])
             gain = prior @ design.T
             error = gain @ np.linalg.solve(design @ gain + np.eye(len(values)), values)
             left = np.abs(gap - slope @ error)[known]

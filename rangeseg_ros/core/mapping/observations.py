@@ -179,8 +179,8 @@ def continuity(before: Floats, now: Floats) -> Floats:
 
     Where most of the pixels are the same it is 1: small motions to and fro are no new looks.
     """
-    alike = np.clip((before * now).sum(axis=1), 0, 1)
-    return np.where(alike >= 0.5, 1.0, alike)
+    shared = np.clip((before * now).sum(axis=1), 0, 1)
+    return np.where(shared >= 0.5, 1.0, shared)
 
 
 def views(labels: Labels, planes: Sequence[Plane], distortion_length: float) -> Floats:

@@ -222,9 +222,9 @@ class PlaneOdometry:
         """Take in where the edges of the frame before are now."""
         last, self._edges = self._edges, edges
         prior = self._covariance[np.ix_(_POSES, _POSES)]
-        told, values = edges.motion(last, self._before, pose, prior)
+        jacobian, values = edges.motion(last, self._before, pose, prior)
         design, noise = np.zeros((len(values), len(self._covariance))), np.eye(len(values))
-        design[:, _POSES] = told
+        design[:, _POSES] = jacobian
         expected = design @ self._covariance
         gain = np.linalg.solve(expected @ design.T + noise, expected).T
         return self._corrected(pose, gain @ values, gain, design, noise)

@@ -45,7 +45,7 @@ class Placement:
     """What is known of a camera at the stamp of an image.
 
     `pose` and `target` take the frame of the image to `fixed_frame` and `target_frame`. `ups` are
-    all directions that are told to be up, and `asked` whether any is asked for. `up` (3,), a unit
+    all directions that are given as up, and `asked` whether any is asked for. `up` (3,), a unit
     vector in the frame of the image with the standard deviation `up_sd`, degrees, is what
     `UpFilter` makes of them: None for that of the parameters, or where `lost` says why it is not
     known. `height`, metres, is that of the image's origin above z = 0 of `gravity_frame`.
@@ -72,7 +72,7 @@ def find_placement(
 ) -> Placement:
     """Look up what the parameters ask for at an image in `frame`.
 
-    Up is told by `gravity_frame` and by the `acceleration` of an accelerometer at rest, its frame
+    Up is given by `gravity_frame` and by the `acceleration` of an accelerometer at rest, its frame
     and measurement (3,).
     """
     found = Placement(asked=bool(config.gravity_frame) or acceleration is not None)
@@ -117,13 +117,13 @@ def find_placement(
 
 
 class UpFilter:
-    """Up by all that tells it; while nothing does, the last one, with an error that grows.
+    """Up by all that gives it; while nothing does, the last one, with an error that grows.
 
     It turns as the planes say that the camera has turned, where the odometry follows these.
     """
 
-    _told: tuple[int, Up, float | None] | None = None
-    _motion: Motion | None = None  # of the frame whose up was told last
+    _last: tuple[int, Up, float | None] | None = None
+    _motion: Motion | None = None  # of the frame whose up was given last
     _before = 0  # stamp of the last frame
 
     def settle(
@@ -131,13 +131,13 @@ class UpFilter:
     ) -> Placement:
         """What was `found` at a stamp, nanoseconds, with its up, or why that is lost.
 
-        What is told is weighted by its precision. It is lost where two directions contradict each
+        What is given is weighted by its precision. It is lost where two directions contradict each
         other, and where the steepest ground may be level as well. `motion` is that of the camera
         up to the last frame.
         """
         if not found.asked:
             return found
-        if motion is None or (self._told and self._told[0] == self._before):
+        if motion is None or (self._last and self._last[0] == self._before):
             self._motion = motion
         since, self._before = (stamp - self._before) / 1e9, stamp
         why = _contradiction(found.ups)
@@ -146,11 +146,11 @@ class UpFilter:
             direction = weight @ [up.direction for up in found.ups]
             direction /= np.linalg.norm(direction)
             sd = found.ups[0].sd if len(weight) == 1 else float(weight.sum() ** -0.5)
-            self._told = stamp, Up(direction, sd, found.sources['up']), found.height
+            self._last = stamp, Up(direction, sd, found.sources['up']), found.height
             return replace(found, up=direction, up_sd=sd)
         why = why or found.sources['up'].removeprefix(f'{PARAMETERS}; ')
-        if self._told is not None and not found.ups:
-            then, up, height = self._told
+        if self._last is not None and not found.ups:
+            then, up, height = self._last
             age, by, direction = (stamp - then) / 1e9, '', up.direction
             error = config.up_drift * age
             if motion and self._motion:

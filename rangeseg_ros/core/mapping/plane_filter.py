@@ -77,7 +77,7 @@ class PlaneFilters(NamedTuple):
         parts: list[Any] = [np.concatenate(pair) for pair in pairs]
         return PlaneFilters(self.planes.joined(others.planes), *parts)
 
-    def alike(
+    def matches(
         self, others: PlaneSet, covariance: Floats, camera: Floats
     ) -> tuple[Indices, Indices, Floats]:
         """Which of these planes and of M others may be one by what is known of both.
@@ -128,9 +128,9 @@ class PlaneFilters(NamedTuple):
         self._correct(np.array([k]), np.linalg.inv(own + other)[None], other @ gap[..., None])
         self.view[k] = 0
 
-    def _correct(self, index: Indices, covariance: Floats, told: Floats) -> None:
-        """Take the errors that covariance @ told (K, 3, 1) is off the planes `index` (K,)."""
-        moved = self.planes.where(index).without((covariance @ told)[..., 0])
+    def _correct(self, index: Indices, covariance: Floats, gap: Floats) -> None:
+        """Take the errors that covariance @ gap (K, 3, 1) is off the planes `index` (K,)."""
+        moved = self.planes.where(index).without((covariance @ gap)[..., 0])
         for whole, part in zip(self.planes, moved, strict=True):
             whole[index] = part
         self.covariance[index] = covariance
@@ -147,7 +147,7 @@ class Jump(NamedTuple):
     """What the fixed frame has moved by against the planes.
 
     `motion` leads from the fixed frame as it was to what it is; `error` (6,) is that motion as a
-    turn about where the `camera` (3,) was told to be, radians, and a shift, metres. Its covariance
+    turn about where the `camera` (3,) was said to be, radians, and a shift, metres. Its covariance
     is large in directions that the planes do not tell.
     """
 
@@ -172,7 +172,7 @@ def find_jump(
     A pose that errs by s, in standard deviations, shows each plane off by z = -B s + v. With
     L = sum B^T R^-1 B the estimate of s has the covariance L^-1 + I, so that s^T L (L + I)^-1 s
     is chi-squared with six degrees of freedom: None where it is chance. Planes that move by
-    themselves have less weight (Cauchy). `camera` (3,) is where the pose that was told has it.
+    themselves have less weight (Cauchy). `camera` (3,) is where the given pose has it.
     """
     deviations = noise.deviations
     motion, error, weight = Transform.identity(), np.zeros(6), np.ones(len(seen.view))

@@ -172,7 +172,7 @@ class PlaneMap:
         after = self._filters.moved(jump.motion, jump.camera, np.zeros((6, 6)))
         pixels, scores = np.array([plane.count for plane in planes]), []
         for filters in (self._filters, after):
-            _, which, value = filters.alike(seen.planes, seen.spread, camera)
+            _, which, value = filters.matches(seen.planes, seen.spread, camera)
             likely = np.zeros(len(planes))
             np.maximum.at(likely, which, np.exp(-value / 2))
             scores.append(likely @ pixels)
@@ -185,7 +185,7 @@ class PlaneMap:
 
     def _associate(self, planes: Sequence[Plane], seen: Observations, camera: Floats) -> Indices:
         """Numbers (M,) of the planes of the map that the planes of a frame are, -1 for none."""
-        index, which, value = self._filters.alike(seen.planes, seen.spread, camera)
+        index, which, value = self._filters.matches(seen.planes, seen.spread, camera)
         at = self._filters.planes.where(index).coordinates(seen.planes.point[which])
         far = np.array([np.hypot(*plane.extents) for plane in planes])[which]
         pairs = zip(index.tolist(), at, far.tolist(), strict=True)
@@ -259,7 +259,7 @@ class PlaneMap:
     def _merge(self, some: Indices, camera: Floats) -> None:
         """Unite planes of the map that turn out to be one with `some` of this frame."""
         filters = self._filters
-        number, others, _ = filters.where(some).alike(filters.planes, filters.covariance, camera)
+        number, others, _ = filters.where(some).matches(filters.planes, filters.covariance, camera)
         kept = np.ones(len(self._records), np.bool_)
         for k, m in zip(some[number].tolist(), others.tolist(), strict=True):
             a, b = self._records[k], self._records[m]

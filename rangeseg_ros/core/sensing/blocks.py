@@ -145,11 +145,11 @@ def _update(
     height, width = inverse.shape
     for bi in range(len(blocks.squared)):
         for bj in range(blocks.squared.shape[1]):
-            alike = True
+            unchanged = True
             for i in range(bi * size, min((bi + 1) * size, height)):
                 for j in range(bj * size, min((bj + 1) * size, width)):
-                    alike &= inverse[i, j] == before[i, j]
-            if not alike:
+                    unchanged &= inverse[i, j] == before[i, j]
+            if not unchanged:
                 _sum_pixels(inverse, rays, pinhole, size, (bi, bj, bi + 1, bj + 1), blocks)
 
 

@@ -61,10 +61,10 @@ def plane_deviation(
     total, count = wide.result()
     nearer = image.inverse * count > total
     # 1 for candidates below the mean, 2 for those above.
-    sides = pixels_beside(jumps).view(np.uint8) << nearer
+    sides = edge_pixels(jumps).view(np.uint8) << nearer
     pixels = _framed(image.inverse)
     for down, result in enumerate(jumps):
-        _find_crossings(pixels, sides, lone, clear, bool(down), result)
+        _find_jumps(pixels, sides, lone, clear, bool(down), result)
     return jumps
 
 
@@ -100,7 +100,7 @@ def _find_deviations(means: Singles, limits: Singles, down: bool, result: Mask) 
 
 
 @njit(cache=True, nogil=True)
-def _find_crossings(
+def _find_jumps(
     pixels: Singles,
     sides: NDArray[np.uint8],
     limits: Singles,
@@ -178,7 +178,7 @@ def sobel(image: RangeImage) -> GridEdges:
     return horizontal & valid[:, 1:] & valid[:, :-1], vertical & valid[1:] & valid[:-1]
 
 
-def pixels_beside(edges: GridEdges) -> Mask:
+def edge_pixels(edges: GridEdges) -> Mask:
     """Pixels (H, W) that a jump separates from one of their four neighbours or more."""
     right, below = edges
     pixels = np.zeros((len(right), below.shape[1]), np.bool_)

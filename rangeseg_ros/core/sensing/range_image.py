@@ -202,8 +202,8 @@ class RangeImage:
         known = self.inverse[self.valid]
         for off, far in ((known < 1 / FAR, f'beyond {FAR}'), (known > 1 / NEAR, f'below {NEAR}')):
             if 2 * np.count_nonzero(off) > known.size:
-                told = f'more than half of the ranges are {far} m: are they in metres?'
-                warnings.warn(told, UnitWarning, stacklevel=3)
+                message = f'more than half of the ranges are {far} m: are they in metres?'
+                warnings.warn(message, UnitWarning, stacklevel=3)
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -64,11 +64,11 @@ class SensorModel(NamedTuple):
     def binned(self, side: int) -> SensorModel:
         """The model of the means of squares of so many pixels along the side."""
         line = np.arange(side)
-        alike = np.zeros((side, side))
+        correlation = np.zeros((side, side))
         if self.correlation > 0:
-            alike = np.exp(-((line[:, None] - line) ** 2) / (4 * self.correlation**2))
+            correlation = np.exp(-((line[:, None] - line) ** 2) / (4 * self.correlation**2))
         white = self.white / side**2
-        left = white + (1 - self.white) * max(float(alike.mean()) ** 2, 1 / side**2)
+        left = white + (1 - self.white) * max(float(correlation.mean()) ** 2, 1 / side**2)
         return self.rescaled(side)._with_variance(left)._replace(white=white / left)
 
     def of_pixels(self, side: int, excess: float) -> SensorModel:
@@ -117,8 +117,8 @@ class SensorModel(NamedTuple):
         """
         if self.correlation == 0:
             return 1.0
-        alike = (1 - self.white) * np.exp(-np.array([1, 2]) / (4 * self.correlation**2))
-        return float(1 + 2 * alike[0] + alike[1])
+        correlation = (1 - self.white) * np.exp(-np.array([1, 2]) / (4 * self.correlation**2))
+        return float(1 + 2 * correlation[0] + correlation[1])
 
     @property
     def region_inflation(self) -> float:

@@ -72,7 +72,7 @@ def judge(
     if not image.valid.any():
         return Verdict(('nothing measured',), ('Nothing in the image is measured.',))
     found = no_depth(image)
-    unit_told = bool(found)
+    unit_known = bool(found)
     if cells := enlargement(image):
         found[f'enlarged x {cells.factor}'] = (
             f'Each measurement fills {cells.factor} x {cells.factor} pixels: the image was '
@@ -91,7 +91,7 @@ def judge(
             'Surfaces are flat only if the values are distances from the camera, not along its '
             'axis: multiply them by 1 / |ray|.'
         )
-    if not unit_told and (factor := improbable_scale(image)):
+    if not unit_known and (factor := improbable_scale(image)):
         hint, times = ' (TUM: 0.0002)', f'{factor:g} times too far'
         if factor < 1:
             hint, times = '', f'{1 / factor:g} times too near'

@@ -230,17 +230,17 @@ def _differences(
 
 
 def _camera_motion(
-    known: Tracks, seen: Tracks, pairs: tuple[Indices, ...], prior: Floats, told: Motion | None
+    known: Tracks, seen: Tracks, pairs: tuple[Indices, ...], prior: Floats, stated: Motion | None
 ) -> Motion:
     """Motion of the known planes to those that are seen, of sure pairs of them.
 
     Gauss-Newton steps for the turn and the shift, weighted by the covariances of the pairs; those
     that fit badly (things that move by themselves) count less. Weights are relative to the median
     misfit, so that a wrong motion is corrected. Directions in which the planes leave the motion
-    open are held by a prior, with the inverse variances `prior` (6,): the motion told, or none.
+    open are held by a prior, with the inverse variances `prior` (6,): the motion stated, or none.
     """
     t, s = pairs
-    rotation, shift = told or (np.eye(3), np.zeros(3))
+    rotation, shift = stated or (np.eye(3), np.zeros(3))
     for _ in range(_MOTION_ROUNDS if len(t) else 0):
         gap, spread, axes, point = _differences(known.moved(rotation, shift), seen, t, s)
         design = by_motion(np.cross(axes[:, 0], axes[:, 1]), axes, point)

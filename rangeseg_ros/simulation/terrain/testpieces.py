@@ -71,7 +71,7 @@ PIECES: dict[str, Callable[[Site, float, float], None]] = {
 """Kinds of test pieces."""
 
 
-def all_pieces() -> Iterator[tuple[str, float, float]]:
+def catalogue() -> Iterator[tuple[str, float, float]]:
     """Kind, size (metres, of ramps degrees) and distance (metres) of every test piece."""
     for kind in PIECES:
         for size in SLOPES if kind == 'ramp' else SIZES:

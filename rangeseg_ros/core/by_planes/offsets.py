@@ -1,4 +1,4 @@
-"""Planes as the sensor bends them: shifted, from place to place, to what is measured there.
+"""Planes as the sensor bends them: moved, from place to place, to what is measured there.
 
 The distortion is smooth: what a plane leaves of the blocks around a place is what it leaves here.
 So a plane theta is taken as the parallel one, (1 + s) theta, through what was measured of its
@@ -19,8 +19,8 @@ from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import RATIO
 
 
-class Shifts(NamedTuple):
-    """Shift s of each plane at the blocks in a box around its surface; 0 elsewhere.
+class Offsets(NamedTuple):
+    """Offset s of each plane at the blocks in a box around its surface; 0 elsewhere.
 
     `box` (K + 1, 4) are the first row and column of blocks, rows and columns; empty for label 0.
     Those of each plane begin in `values` at `start` (K + 1,), row by row.
@@ -31,21 +31,21 @@ class Shifts(NamedTuple):
     values: Singles
 
     @classmethod
-    def none(cls, count: int) -> Shifts:
-        """No shifts of so many labels, 0 included."""
+    def none(cls, count: int) -> Offsets:
+        """No offsets of so many labels, 0 included."""
         box, start = np.zeros((count, 4), np.intp), np.zeros(count, np.intp)
         return cls(box, start, np.zeros(0, np.float32))
 
 
-def shifts(
+def local_offsets(
     surfaces: Ints, blocks: Floats, theta: Floats, reach: int, around: int, block_inflation: float
-) -> Shifts:
-    """Shifts of planes (K + 1, 3) to the blocks of their surfaces (rows, columns), 0 for none.
+) -> Offsets:
+    """Offsets of planes (K + 1, 3) to the blocks of their surfaces (rows, columns), 0 for none.
 
     With w the weights of pixels and e what theta leaves of them, s is the least-squares solution
     sum(w e theta.r) / sum(w (theta.r)^2) over the blocks `around` on each side, of weighted
     moments (rows, columns, 13), drawn towards 0 by n / (n + noise / distortion), in variances.
-    Shifts are told up to `reach` blocks around a surface.
+    Offsets are computed up to `reach` blocks around a surface.
     """
     box = find_boxes(surfaces, len(theta))
     corner = np.maximum(box[:, :2] - reach, 0)
@@ -53,16 +53,16 @@ def shifts(
     extent[box[:, 2] == 0] = 0
     end = np.cumsum(extent.prod(axis=1))
     start = end - extent.prod(axis=1)
-    local = Shifts(np.hstack([corner, extent]), start, np.zeros(end[-1], np.float32))
+    local = Offsets(np.hstack([corner, extent]), start, np.zeros(end[-1], np.float32))
     map_halves(
-        _find_shifts, len(theta), local, _inner(surfaces), blocks, theta, around, block_inflation
+        _find_offsets, len(theta), local, _inner(surfaces), blocks, theta, around, block_inflation
     )
     return local
 
 
 @njit(cache=True, inline='always')
-def shift_at(local: Shifts, label: int, row: int, column: int) -> float:
-    """Shift of a plane at a block."""
+def offset_at(local: Offsets, label: int, row: int, column: int) -> float:
+    """Offset of a plane at a block."""
     box = local.box[label]
     i, j = row - box[0], column - box[1]
     if i < 0 or j < 0 or i >= box[2] or j >= box[3]:
@@ -80,17 +80,17 @@ def _inner(surfaces: Ints) -> Ints:
 
 
 @njit(cache=True, nogil=True)
-def _find_shifts(
+def _find_offsets(
     first: int,
     after: int,
-    local: Shifts,
+    local: Offsets,
     inner: Ints,
     blocks: Floats,
     theta: Floats,
     around: int,
     block_inflation: float,
 ) -> None:
-    """Fill in the shifts of planes first...after, from sums over windows of blocks."""
+    """Fill in the offsets of planes first...after, from sums over windows of blocks."""
     window = np.empty(3)
     for k in range(max(first, 1), after):
         top, left, rows, columns = local.box[k]

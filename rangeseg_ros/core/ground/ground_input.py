@@ -16,7 +16,7 @@ from rangeseg_ros.core.sensing.sensor import SensorModel
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Survey:
+class GroundInput:
     """What finding the ground takes.
 
     `up` (3,) is a unit vector in the frame of the image, `sensor_height` that above the ground
@@ -38,7 +38,7 @@ class Survey:
     cells: Cells | None = None
 
     @classmethod
-    def of(cls, image: RangeImage, sensor: SensorModel, config: Config) -> Survey:
+    def of(cls, image: RangeImage, sensor: SensorModel, config: Config) -> GroundInput:
         """With the parameters of `config`; up is by default that of a level camera."""
         up = unit(image.level_up if config.level else (config.up_x, config.up_y, config.up_z))
         return cls(image, sensor, config, up, config.sensor_height, GroundMemory(config))
