@@ -55,7 +55,8 @@ ROOMS = {
     'realsense, curved': 'rooms --sensor realsense --scene curved',
 }
 DAMAGED = 'kinect', 'realsense', 'tof'
-DAMAGES = 'holes', 'enlarged', 'rounded', 'disparity'
+NO_DEPTH = 'rounded', 'disparity'
+DAMAGES = 'holes', 'enlarged', *NO_DEPTH
 # By the names of a set and a frame, the first that fits; all others are of other sensors.
 KINDS = {'Kinect': r'^(annotated|nyu)|kinect', 'RealSense': r'realsense|/rs_|any6d|d4\d\d'}
 
@@ -83,7 +84,9 @@ class Frame(NamedTuple):
         if not len(overlap.truth):
             return {'ms': 1e3 * spent}
         iou = float(overlap.best_iou.mean())
-        found = {'ms': 1e3 * spent, self.kind: iou, 'all': iou}
+        found = {'ms': 1e3 * spent, self.kind: iou}
+        if self.kind not in NO_DEPTH:
+            found['all'] = iou
         if judged is not None and (judged & (regions == 0)).any():
             sizes = np.bincount(result.labels.ravel())
             called = (sizes[result.labels] >= 3000) & (result.labels > 0)
@@ -109,10 +112,10 @@ class Frame(NamedTuple):
     def damaged(self, damage: str) -> Frame:
         """As a worse sensor, or a careless driver, leaves it; see `docs/ledger.md`."""
         inverse, labels, camera = self.image.inverse, self.truth.labels, self.image.camera
-        if damage in ('rounded', 'disparity'):
+        if damage in NO_DEPTH:
             depth = self.image.points[..., 2]
             with np.errstate(divide='ignore'):
-                values = np.round(depth / 0.08) * 0.08 if damage == 'rounded' else 40 / depth
+                values = np.round(depth, 1) if damage == 'rounded' else 40 / depth
             image = RangeImage.from_depth(np.nan_to_num(values, posinf=0), camera)
             return self._replace(kind=damage, image=image, planes={})
         if damage == 'holes':

@@ -126,15 +126,10 @@ class SequenceSegmenter:
         if up_sd not in (None, config.up_sd):
             config = replace(config, up_sd=up_sd)
         if stamp < self._stamp:
-            self._tracker.reset()
-            self.map = self.map.restarted('time has gone back')
-            self._ground.forget()
-            self._pose = None
+            self._forget()
         # Errors and what is in sight follow from where the sensor is: all is seen from there.
-        sensor = Transform(np.eye(3), image.place)
-        planes = result.planes
-        if image.place.any():
-            planes = moved_planes(planes, sensor.inverse())
+        sensor, away = Transform(np.eye(3), image.place), image.place.any()
+        planes = moved_planes(result.planes, sensor.inverse()) if away else result.planes
         pose = pose.after(sensor) if pose else None
         motion = pose.inverse().after(self._pose) if pose and self._pose else None
         self._stamp, self._pose = stamp, pose
@@ -167,11 +162,16 @@ class SequenceSegmenter:
                 pose=pose,
                 fixed_frame=config.map_frame,
             )
-        planes = [
-            plane.named(id=seen.id, surface=seen.surface, role=seen.role)
-            for plane, seen in zip(result.planes, planes, strict=True)
-        ]
+        known = zip(result.planes, planes, strict=True)
+        planes = [p.named(id=seen.id, surface=seen.surface, role=seen.role) for p, seen in known]
         return replace(result, planes=planes, source=source)
+
+    def _forget(self) -> None:
+        """Time has gone back: match nothing to what is known."""
+        self._tracker.reset()
+        self.map = self.map.restarted('time has gone back')
+        self._ground.forget()
+        self._pose = None
 
 
 def with_roles(
