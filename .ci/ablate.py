@@ -193,12 +193,11 @@ What each mechanism (`.ci/mechanisms.py`) costs and buys: `make ablate` (`.ci/ab
 - *lines*, *constants*: of its modules or functions; *ms*: processor time it takes. Other columns:
   the change when it is switched off, plus or minus the standard error over sensors, kinds of
   scenes or rooms; of an option, off by default, what is lacking without it.
-- IoU in thousandths, of sensors by their kind, of simulated rooms, and of those in which 30 % of
-  the pixels are lost (*holes*) or all but every fourth row and column (*enlarged*), and, not in
-  *all*, of steps of 10 cm (*rounded*) and of disparities (*disparity*). *curved*: share of what is
-  not planar that is called a plane. In simulated rooms *border*: F measure of borders within 2
-  pixels; *faces*: IoU of faces seen in parts; *angle*: median error of normals, thousandths of a
-  degree. Lengths of tracks are in tenths of a frame, of walks and back.
+- IoU in thousandths, of sensors by their kind, of simulated rooms, and of those without 30 % of the
+  pixels (*holes*), with each fourth row and column four times (*enlarged*) or, not in *all*, in
+  steps of 10 cm (*rounded*) or disparities. *curved*: share of what is not planar that is called a
+  plane. Simulated, *border*: F measure of borders within 2 pixels; *faces*: IoU of faces in parts;
+  *angle*: median error of normals, thousandths of a degree. Lengths of tracks: tenths of a frame.
 - *verdict*: earns by a gain above two standard errors in a column, or one over all sensors; harms
   by such a loss; *safety*: the kinds of scenes in which more than 1 % of a hazard is called ground
   without it; *not shown*: all changes are within chance.
