@@ -193,8 +193,8 @@ What each mechanism (`.ci/mechanisms.py`) costs and buys: `make ablate` (`.ci/ab
 - *lines*, *constants*: of its modules or functions; *ms*: processor time it takes. Other columns:
   the change when it is switched off, plus or minus the standard error over sensors, kinds of
   scenes or rooms; of an option, off by default, what is lacking without it.
-- IoU in thousandths, of sensors by their kind, of simulated rooms, and of those without 30 % of the
-  pixels (*holes*), with each fourth row and column four times (*enlarged*) or, not in *all*, in
+- IoU in thousandths, of sensors by their kind, of simulated rooms, and of those without 30 % of
+  the pixels (*holes*), with each fourth row and column four times (*enlarged*), not in *all*, in
   steps of 10 cm (*rounded*) or disparities. *curved*: share of what is not planar that is called a
   plane. Simulated, *border*: F measure of borders within 2 pixels; *faces*: IoU of faces in parts;
   *angle*: median error of normals, thousandths of a degree. Lengths of tracks: tenths of a frame.
