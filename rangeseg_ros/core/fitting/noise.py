@@ -223,7 +223,8 @@ def _split(within: list[float], between: float, filled: float) -> tuple[float, f
         np.where(white < 0, b / bb, np.maximum(correlated, 0)),
     )
     error = ((white[:, None] * one + correlated[:, None] * other - 1) ** 2).sum(axis=1)
-    best = int(np.argmin(error))
+    # The narrowest of those that fit alike: rounding is not to decide.
+    best = int(np.argmax(np.isclose(error, error.min())))
     total = white[best] + correlated[best]
     return float(total), float(white[best] / total), _WIDTHS[best]
 
