@@ -110,7 +110,7 @@ class Frame(NamedTuple):
         }
 
     def damaged(self, damage: str) -> Frame:
-        """As a worse sensor, or a careless driver, leaves it; see `docs/ledger.md`."""
+        """With holes, enlarged, rounded to 10 cm, or as disparities; see `docs/ledger.md`."""
         inverse, labels, camera = self.image.inverse, self.truth.labels, self.image.camera
         if damage in NO_DEPTH:
             depth = self.image.points[..., 2]
