@@ -206,16 +206,34 @@ def test_what_was_the_ground_stays_it_while_it_is_out_of_view():
     assert share('table', 0.0, GROUND) > 0.95
 
 
-def test_a_chain_goes_on_a_while_after_what_is_off_the_ground():
-    """Rows of 2 cm: one 30 mm high, and from then on 16, within half a step but on the same."""
-    rows, columns = np.indices((30, 9))
-    height = np.select([rows < 10, rows < 11], [0.0, 0.03], 0.016)
-    place = np.stack([height, 0.5 + 0.02 * rows, 0.02 * (columns - 4)])
-    config = Config(robot_radius=0.1, ground_gap=0.1, ground_slope=30.0)
-    reached = reach(place, np.full(rows.shape, 4e-6), config)
-    assert reached[:9].all() and not reached[9:13].any()
-    # 16 mm and what is left of 14 more after 6 cm are within 25, half a step.
-    assert reached[13:].all()
+def test_what_is_off_the_ground_stays_off_as_far_as_its_surface_goes():
+    """40 mm up, and 24 farther away, within half a step of the ground beside and behind it."""
+    rows, columns = np.indices((50, 40))
+    top = (rows >= 10) & (rows < 40) & (columns < 20)
+    place = np.stack([top * np.where(rows < 30, 0.04, 0.024), 0.5 + 0.02 * rows, 0.02 * columns])
+    variance = np.where((rows >= 40) & (rows < 42) & (columns < 20), 0.0, 4e-6)
+    reached = reach(place, variance, Config())
+    # But for three cells along its side, where the ground is as near as it is.
+    assert not (reached & top)[:, :17].any() and reached[:, 24:].all() and reached[42:].all()
+
+
+def test_a_chain_comes_back_on_the_other_side_of_an_obstacle():
+    """Ground that walls hide from the front and the right is reached from behind them."""
+    rows, columns = np.indices((40, 40))
+    wall = ((rows == 10) & (columns < 20)) | ((columns == 20) & (rows >= 10) & (rows < 30))
+    place = np.stack([0.5 * wall, 0.5 + 0.02 * rows, 0.02 * (columns - 30)])
+    reached = reach(place, np.full(rows.shape, 4e-6), Config(robot_radius=0.1, ground_gap=0.1))
+    # What is within two cells of a wall is none of the ground.
+    assert reached[13:, :18].all() and not reached[wall].any()
+
+
+def test_a_chain_begins_straight_ahead():
+    """On a bridge, 4 cm above a floor that comes into view beside it, and nearer."""
+    rows, columns = np.indices((40, 60))
+    beside = abs(columns - 30) > 5
+    place = np.stack([-0.04 * beside, 1 + 0.02 * rows, 0.05 * (columns - 30)])
+    reached = reach(place, np.where((rows < 5) & ~beside, 0.0, 4e-6), Config())
+    assert reached[6:, 27:34].all() and not reached[:, beside[0]].any()
 
 
 def test_no_chain_goes_down_an_edge_that_is_blurred_over_two_cells():

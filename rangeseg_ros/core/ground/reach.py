@@ -1,9 +1,9 @@
 """Ground is reached if a chain of ground cells leads from the robot to it.
 
-Cells beside no step and on no slope are visited from near to far. The expected height of a cell is
-the mean of the cells reached last in its own column and those beside it, where each column keeps
-an exponential moving average: so a chain can go around an obstacle. The offset of a column that
-leaves the ground fades with distance: noise that hides an edge farther away leads no chain across.
+Cells beside no step and on no slope are visited from near to far and back: a chain can go around
+an obstacle. Each is told the ground there: the weighted mean of what the last cells of its own
+column and those beside it were told or, where they are ground, of a moving average of these. What
+is off it is so as far as its surface goes: noise that hides an edge leads no chain across.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ def reach(place: Floats, variance: Floats, config: Config) -> Mask:
     reached = np.zeros(even.shape, np.bool_)
     if not even.any():
         return reached
-    # Where the ground comes into view, no farther than the robot is wide from the nearest of it,
-    # and no step above or below most of that. It is near height 0, if anything is.
+    # Where the ground comes into view straight ahead, no farther from the nearest of it than the
+    # robot is wide, and no step above or below most of that. It is near height 0, if anything is.
     begin = even & (np.abs(place[0]) < HIGHEST_STEP)
     begin = begin if begin.any() else even
-    front, columns = begin.argmax(axis=0), np.arange(even.shape[1])
+    front, columns, seen = begin.argmax(axis=0), np.arange(even.shape[1]), begin.any(axis=0)
     h, x, y = place[:, front, columns]
-    distance = np.where(begin.any(axis=0), np.hypot(x, y), np.inf)
-    near = distance <= distance.min() + radius
-    start = near & (np.abs(h - np.median(h[near])) < step / 2)
+    nearest = np.lexsort((np.hypot(x, y), np.abs(y) > radius, ~seen))[0]
+    start = seen & (np.hypot(x - x[nearest], y - y[nearest]) <= radius)
+    start &= np.abs(h - np.median(h[start])) < step / 2
     reached[front[start], columns[start]] = True
     _spread(place, variance, even, step / 2, slope, config.ground_gap, radius, reached)
     return reached
@@ -109,54 +109,59 @@ def _spread(
     radius: float,
     reached: Mask,
 ) -> None:
-    """Add to where chains start what they reach, with the nearest row first."""
+    """Add to where chains start what they reach, from the nearest row to the last and back."""
     rows, columns = variance.shape
     # The steepest ground rises by a quarter of a step over the length of the mean: its lag behind
     # a slope that begins, the noise, and half a step are told apart.
     length = half / 2 / slope
-    # Of each column: weight, mean, and where the cell is that was reached last; how far what is
-    # seen is off the ground that leads to it, and where that was seen last.
-    weight, mean, off = np.zeros(columns), np.zeros(columns), np.zeros(columns)
-    last, seen = np.full((columns, 3), np.nan), np.full((columns, 4), np.nan)
-    for i in range(rows):
+    # Of each column: the height of the ground, its weight, and where it was told last, or reached.
+    level, weight = np.zeros(columns), np.zeros(columns)
+    told, ground = np.full((columns, 2), np.nan), np.full((columns, 2), np.nan)
+    # Height and row of what was seen off the ground last; what was stays so when chains come back.
+    other, row = np.full(columns, np.nan), np.zeros(columns, np.intp)
+    rejected = np.zeros(reached.shape, np.bool_)
+    for k in range(2 * rows):
+        i = min(k, 2 * rows - 1 - k)
         # Both ways along a row: a cell that nothing leads to from the left, from the right.
         for n in range(2 * columns):
             c = n if n < columns else 2 * columns - 1 - n
-            if not variance[i, c] > 0 or (n >= columns and reached[i, c]):
+            free = even[i, c] and not rejected[i, c]
+            # What cannot be reached is told its ground on the way back along the row.
+            if not variance[i, c] > 0 or (reached[i, c] if n >= columns else not free):
                 continue
             h, x, y = place[0, i, c], place[1, i, c], place[2, i, c]
-            if reached[i, c]:
-                apart, nearest = 0.0, 0.0
-            else:
-                total = summed = 0.0
-                nearest = np.inf
+            if not reached[i, c]:
+                noise, total, summed, count = CLEARLY * np.sqrt(variance[i, c]), 0.0, 0.0, 0
+                nearest = closest = np.inf
                 for q in range(max(c - _NEIGHBOURS, 0), min(c + _NEIGHBOURS + 1, columns)):
-                    square = (last[q, 1] - x) ** 2 + (last[q, 2] - y) ** 2
-                    if square <= radius * radius:
-                        nearest = min(nearest, square)
-                        total += weight[q]
-                        summed += weight[q] * mean[q]
-                if total == 0:
+                    square = (ground[q, 0] - x) ** 2 + (ground[q, 1] - y) ** 2
+                    nearest = square if square < nearest else nearest
+                    square = (told[q, 0] - x) ** 2 + (told[q, 1] - y) ** 2
+                    if not square <= radius * radius:
+                        continue
+                    count, closest = count + 1, min(closest, square)
+                    total += weight[q]
+                    summed += weight[q] * level[q]
+                    # Of the surface that is off the ground: it is off by as much.
+                    if even[i, c] and abs(i - row[q]) <= 1 and abs(h - other[q]) < half + noise:
+                        summed += weight[q] * (h - other[q])
+                if count == 0:
                     continue
-                apart = h - summed / total
-            near = abs(apart) < half and nearest <= gap * gap
-            way = np.sqrt((seen[c, 1] - x) ** 2 + (seen[c, 2] - y) ** 2)
-            # Over a wall, or beyond an edge, it is another surface.
-            noise = np.sqrt(variance[i, c] + seen[c, 3])
-            if abs(h - seen[c, 0]) < slope * way + CLEARLY * noise and way < radius:
-                apart += (off[c] - apart) * np.exp(-way / radius)
-            leads = even[i, c] and near and abs(apart) < half
-            if not leads and n < columns:
-                continue
-            off[c] = apart
-            seen[c, 0], seen[c, 1], seen[c, 2], seen[c, 3] = h, x, y, variance[i, c]
-            if not leads:
-                continue
-            reached[i, c] = True
-            kept = 0.0
-            if weight[c] > 0:
-                way = np.sqrt((last[c, 1] - x) ** 2 + (last[c, 2] - y) ** 2)
-                kept = weight[c] * np.exp(-way / length)
+                apart = abs(h - summed / total)
+                if not (free and nearest <= gap * gap and apart < half):
+                    if n >= columns:
+                        off = apart > half + noise
+                        rejected[i, c] |= off
+                        level[c], weight[c] = summed / total, total / count
+                        if not off:
+                            weight[c] *= np.exp(-np.sqrt(closest) / radius)
+                        told[c, 0], told[c, 1] = x, y
+                        other[c], row[c] = h if off and even[i, c] else np.nan, i
+                    continue
+            reached[i, c], other[c] = True, np.nan
+            way = np.sqrt((told[c, 0] - x) ** 2 + (told[c, 1] - y) ** 2)
+            kept = weight[c] * np.exp(-way / length) if weight[c] > 0 else 0.0
             weight[c] = kept + 1 / variance[i, c]
-            mean[c] += (h - mean[c]) / (variance[i, c] * weight[c])
-            last[c, 0], last[c, 1], last[c, 2] = h, x, y
+            level[c] += (h - level[c]) / (variance[i, c] * weight[c])
+            told[c, 0], told[c, 1] = x, y
+            ground[c, 0], ground[c, 1] = x, y

@@ -117,7 +117,7 @@ def judge(
 
 def no_depth(image: RangeImage) -> dict[str, str]:
     """Why an image is no depth in metres at all, as far as that is quick to see."""
-    rows, found = image.inverse[::8], dict[str, str]()
+    rows, found = image.inverse[::16], dict[str, str]()
     both = (rows[:, 1:] > 0) & (rows[:, :-1] > 0)
     if not both.any():
         return found

@@ -45,10 +45,6 @@ def _wavy(site: Site) -> None:
     )
 
 
-def _drop(site: Site) -> None:
-    site.step(site.ahead(), -site.one_of(0.05, 0.06, 0.08, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0))
-
-
 def _hole(site: Site) -> None:
     near = site.ahead(0.2, 1.0)
     far, side = near + site.random.uniform(0.3, 0.9), site.random.uniform(0.2, 0.8)
@@ -266,7 +262,9 @@ KINDS: dict[str, Callable[[Site], None]] = {
     'low boxes': _low,
     'clutter': _clutter,
     'waves': _wavy,
-    'drop': _drop,
+    'drop': lambda site: site.step(
+        site.ahead(), -site.one_of(0.05, 0.06, 0.08, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0)
+    ),
     'hole': _hole,
     'pit': _hole,
     'stairs down': _stairs,

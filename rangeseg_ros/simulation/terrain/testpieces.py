@@ -39,10 +39,6 @@ def _kerb(site: Site, ahead: float, size: float) -> None:
     site.off_level(ahead, FAR, size, size)
 
 
-def _edge(site: Site, ahead: float, size: float) -> None:
-    site.step(ahead, -size)
-
-
 def _gap(site: Site, ahead: float, size: float) -> None:
     """Its far side belongs to it."""
     site.gap(ahead, size)
@@ -64,7 +60,7 @@ PIECES: dict[str, Callable[[Site, float, float], None]] = {
     'cylinder': _cylinder,
     'box': _box,
     'kerb': _kerb,
-    'edge': _edge,
+    'edge': lambda site, ahead, size: site.step(ahead, -size),
     'gap': _gap,
     'ramp': _ramp,
 }
