@@ -245,6 +245,10 @@ def test_no_chain_goes_down_an_edge_that_is_blurred_over_two_cells():
     place = np.stack([height, 2.0 + 0.04 * rows, 0.034 * columns])
     reached = reach(place, np.full(rows.shape, 0.0055**2), Config())
     assert reached[:, :9].all() and not reached[20:, 10:].any()
+    # Rows of 5 cm, 10 mm of noise: each part of the edge is lower by less than half a step.
+    height = np.select([rows < 10, rows < 11, rows < 12], [0.0, -0.022, -0.036], -0.05)
+    place = np.stack([height, 1.0 + 0.05 * rows, 0.034 * columns])
+    assert not reach(place, np.full(rows.shape, 1e-4), Config())[11:].any()
 
 
 def test_ground_between_a_wall_and_a_hole_is_no_slope():

@@ -1,9 +1,9 @@
 """Ground is reached if a chain of ground cells leads from the robot to it.
 
-Cells beside no step and on no slope are visited from near to far and back: a chain can go around
-an obstacle. Each is told the ground there: the weighted mean of what the last cells of its own
-column and those beside it were told or, where they are ground, of a moving average of these. What
-is off it is so as far as its surface goes: noise that hides an edge leads no chain across.
+Cells beside no step and on no slope are visited from near to far and back, around obstacles. Each
+is told the ground there: the weighted mean of what its own column and those beside it were told,
+or of a moving average where they are ground. What is off it is so as far as its surface goes:
+noise that hides an edge leads no chain across.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def _spread(
             # What cannot be reached is told its ground on the way back along the row.
             if not variance[i, c] > 0 or (reached[i, c] if n >= columns else not free):
                 continue
-            h, x, y = place[0, i, c], place[1, i, c], place[2, i, c]
+            h, x, y, apart = place[0, i, c], place[1, i, c], place[2, i, c], 0.0
             if not reached[i, c]:
                 noise, total, summed, count = CLEARLY * np.sqrt(variance[i, c]), 0.0, 0.0, 0
                 nearest = closest = np.inf
@@ -161,7 +161,9 @@ def _spread(
             reached[i, c], other[c] = True, np.nan
             way = np.sqrt((told[c, 0] - x) ** 2 + (told[c, 1] - y) ** 2)
             kept = weight[c] * np.exp(-way / length) if weight[c] > 0 else 0.0
-            weight[c] = kept + 1 / variance[i, c]
-            level[c] += (h - level[c]) / (variance[i, c] * weight[c])
+            # The less the farther off (Cauchy's weight): a blurred edge leads down in two halves.
+            own = 1 / (variance[i, c] * (1 + (apart / half) ** 2))
+            weight[c] = kept + own
+            level[c] += (h - level[c]) * own / weight[c]
             told[c, 0], told[c, 1] = x, y
             ground[c, 0], ground[c, 1] = x, y
