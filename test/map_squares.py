@@ -18,25 +18,12 @@ def plane(number, normal, at, sigma, size=2.0):
     jacobian = np.block([[axes.T, np.zeros((3, 1))], [-axes @ at, 1]])
     covariance = jacobian @ np.diag([sigma**2, sigma**2, 1e-6]) @ jacobian.T
     shape = Shape(size**2, np.array([size, size]), np.array(at), np.eye(3))
-    return MapPlane(
-        label=number,
-        id=number,
-        surface=number,
-        normal=normal,
-        distance=float(-normal @ at),
-        covariance=covariance,
-        centroid=np.array(at, float),
-        count=1000,
-        rms=0.002,
-        probability=1.0,
-        confidence=1.0,
-        shape=shape,
-        outline=MapOutline([[corners]]),
-        observations=9,
-        age=1.0,
-        first_stamp=0,
-        last_stamp=10**9,
-    )
+    names = dict.fromkeys(('label', 'id', 'surface'), number)
+    place = {'centroid': np.array(at, float), 'shape': shape, 'outline': MapOutline([[corners]])}
+    sure = {'count': 1000, 'rms': 0.002, 'probability': 1.0, 'confidence': 1.0}
+    seen = {'observations': 9, 'age': 1.0, 'first_stamp': 0, 'last_stamp': 10**9}
+    equation = {'normal': normal, 'distance': float(-normal @ at), 'covariance': covariance}
+    return MapPlane(**names, **equation, **place, **sure, **seen)
 
 
 def observed(random, face, pose, root, lasting=0.0):
@@ -48,13 +35,8 @@ def observed(random, face, pose, root, lasting=0.0):
     error = np.sqrt(LASTING) * lasting + np.sqrt(1 - LASTING) * random.standard_normal(3)
     off = np.append(normal, distance) + errors @ error
     off /= np.linalg.norm(off[:3])
-    return SimpleNamespace(
-        normal=off[:3],
-        distance=off[3],
-        covariance=errors @ errors.T / RESIDUE,
-        centroid=centroid - (off[:3] @ centroid + off[3]) * off[:3],
-        confidence=1.0,
-        rms=0.0,
-        area=1.0,
-        count=1000,
-    )
+    centroid = centroid - (off[:3] @ centroid + off[3]) * off[:3]
+    covariance = errors @ errors.T / RESIDUE
+    equation = {'normal': off[:3], 'distance': off[3], 'covariance': covariance}
+    sure = {'confidence': 1.0, 'rms': 0.0, 'area': 1.0, 'count': 1000}
+    return SimpleNamespace(**equation, centroid=centroid, **sure)

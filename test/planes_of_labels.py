@@ -39,19 +39,16 @@ def painted(camera, *regions):
 def stated_plane(label, hull=SQUARE, holes=()):
     """A region of the plane z = 2 m."""
     centre, frame = np.array([0.0, 0.25, 2.0]), np.diag([1.0, -1.0, -1.0])
+    names = {'label': label, 'id': label + 100, 'surface': label}
+    sure = {'count': 1000 * label, 'rms': 0.003, 'confidence': 0.9, 'probability': 0.75}
     return Plane(
-        label=label,
-        id=label + 100,
-        surface=label,
+        **names,
+        **sure,
         role=('other', 'floor', 'wall')[label % 3],
         normal=np.array([0.0, 0.0, -1.0]),
         distance=2.0,
         covariance=np.arange(16.0).reshape(4, 4),
         centroid=np.array([0.25 * label, 0.5, 2.0]),
-        count=1000 * label,
-        rms=0.003,
-        confidence=0.9,
-        probability=0.75,
         shape=Shape(4.0, np.array([2.0, 1.5]), centre, frame),
         outline=MapOutline([[np.array(ring, float).reshape(-1, 3) for ring in (hull, *holes)]]),
     )

@@ -207,13 +207,12 @@ def test_what_was_the_ground_stays_it_while_it_is_out_of_view():
 
 
 def test_what_is_off_the_ground_stays_off_as_far_as_its_surface_goes():
-    """40 mm up, and 24 farther away, within half a step of the ground beside and behind it."""
+    """40 mm up, then 24, within half a step of the ground: 3 cells beside that may be reached."""
     rows, columns = np.indices((50, 40))
     top = (rows >= 10) & (rows < 40) & (columns < 20)
     place = np.stack([top * np.where(rows < 30, 0.04, 0.024), 0.5 + 0.02 * rows, 0.02 * columns])
     variance = np.where((rows >= 40) & (rows < 42) & (columns < 20), 0.0, 4e-6)
     reached = reach(place, variance, Config())
-    # But for three cells along its side, where the ground is as near as it is.
     assert not (reached & top)[:, :17].any() and reached[:, 24:].all() and reached[42:].all()
 
 
