@@ -167,9 +167,9 @@ class Segmenter:
         described = fits, roots, errors, probability[flat]
         planes = describe_regions(relabel(regions, numbers), view.whole, *described)
         labels = found.result()
-        told = labels, planes, watch.laps, '', sensor, labelling, jumps
+        known = labels, planes, watch.laps, '', sensor, labelling, jumps
         result = Segmentation(
-            *told,
+            *known,
             upright=(config.role_tolerance, config.role_area, config.ground_slope),
             work_budget=config.work_budget,
             image=image,

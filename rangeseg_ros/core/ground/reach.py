@@ -1,8 +1,8 @@
 """Ground is reached if a chain of ground cells leads from the robot to it.
 
 Cells beside no step and on no slope are visited from near to far and back, around obstacles. Each
-is told the ground there: the weighted mean of what its own column and those beside it were told,
-or of a moving average where they are ground. What is off it is so as far as its surface goes:
+gets the height of the ground there: the weighted mean of what its own column and those beside it
+have, a moving average where they are ground. What is off it is so as far as its surface goes:
 noise that hides an edge leads no chain across.
 """
 
@@ -29,7 +29,7 @@ def reach(place: Floats, variance: Floats, config: Config) -> Mask:
     `place` (3, rows, columns) is height and horizontal position, metres, NaN where nothing is
     measured, with the nearest row first; `variance` that of the height, 0 for cells that are no
     part of a chain. `robot_radius` says how far ground is looked for that leads to a cell, and how
-    much farther than the nearest ground in view a chain begins.
+    far from the nearest ground straight ahead a chain begins.
     """
     step, slope, radius = config.least_step, config.steepest, config.robot_radius
     across = Task(_without_steps, 1, place, variance, step, slope)
@@ -114,11 +114,11 @@ def _spread(
     # The steepest ground rises by a quarter of a step over the length of the mean: its lag behind
     # a slope that begins, the noise, and half a step are told apart.
     length = half / 2 / slope
-    # Of each column: the height of the ground, its weight, and where it was told last, or reached.
+    # Of each column: height of the ground, its weight, and the last cell, visited or reached.
     level, weight = np.zeros(columns), np.zeros(columns)
-    told, ground = np.full((columns, 2), np.nan), np.full((columns, 2), np.nan)
+    visited, ground = np.full((columns, 2), np.nan), np.full((columns, 2), np.nan)
     # Height and row of what was seen off the ground last; what was stays so when chains come back.
-    other, row = np.full(columns, np.nan), np.zeros(columns, np.intp)
+    surface, row = np.full(columns, np.nan), np.zeros(columns, np.intp)
     rejected = np.zeros(reached.shape, np.bool_)
     for k in range(2 * rows):
         i = min(k, 2 * rows - 1 - k)
@@ -126,7 +126,7 @@ def _spread(
         for n in range(2 * columns):
             c = n if n < columns else 2 * columns - 1 - n
             free = even[i, c] and not rejected[i, c]
-            # What cannot be reached is told its ground on the way back along the row.
+            # What cannot be reached gets its ground on the way back along the row.
             if not variance[i, c] > 0 or (reached[i, c] if n >= columns else not free):
                 continue
             h, x, y, apart = place[0, i, c], place[1, i, c], place[2, i, c], 0.0
@@ -136,15 +136,15 @@ def _spread(
                 for q in range(max(c - _NEIGHBOURS, 0), min(c + _NEIGHBOURS + 1, columns)):
                     square = (ground[q, 0] - x) ** 2 + (ground[q, 1] - y) ** 2
                     nearest = square if square < nearest else nearest
-                    square = (told[q, 0] - x) ** 2 + (told[q, 1] - y) ** 2
+                    square = (visited[q, 0] - x) ** 2 + (visited[q, 1] - y) ** 2
                     if not square <= radius * radius:
                         continue
                     count, closest = count + 1, min(closest, square)
                     total += weight[q]
                     summed += weight[q] * level[q]
                     # Of the surface that is off the ground: it is off by as much.
-                    if even[i, c] and abs(i - row[q]) <= 1 and abs(h - other[q]) < half + noise:
-                        summed += weight[q] * (h - other[q])
+                    if even[i, c] and abs(i - row[q]) <= 1 and abs(h - surface[q]) < half + noise:
+                        summed += weight[q] * (h - surface[q])
                 if count == 0:
                     continue
                 apart = abs(h - summed / total)
@@ -155,15 +155,15 @@ def _spread(
                         level[c], weight[c] = summed / total, total / count
                         if not off:
                             weight[c] *= np.exp(-np.sqrt(closest) / radius)
-                        told[c, 0], told[c, 1] = x, y
-                        other[c], row[c] = h if off and even[i, c] else np.nan, i
+                        visited[c, 0], visited[c, 1] = x, y
+                        surface[c], row[c] = h if off and even[i, c] else np.nan, i
                     continue
-            reached[i, c], other[c] = True, np.nan
-            way = np.sqrt((told[c, 0] - x) ** 2 + (told[c, 1] - y) ** 2)
+            reached[i, c], surface[c] = True, np.nan
+            way = np.sqrt((visited[c, 0] - x) ** 2 + (visited[c, 1] - y) ** 2)
             kept = weight[c] * np.exp(-way / length) if weight[c] > 0 else 0.0
             # The less the farther off (Cauchy's weight): a blurred edge leads down in two halves.
             own = 1 / (variance[i, c] * (1 + (apart / half) ** 2))
             weight[c] = kept + own
             level[c] += (h - level[c]) * own / weight[c]
-            told[c, 0], told[c, 1] = x, y
+            visited[c, 0], visited[c, 1] = x, y
             ground[c, 0], ground[c, 1] = x, y
