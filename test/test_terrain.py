@@ -211,18 +211,17 @@ def test_what_is_off_the_ground_stays_off_as_far_as_its_surface_goes():
     rows, columns = np.indices((50, 40))
     top = (rows >= 10) & (rows < 40) & (columns < 20)
     place = np.stack([top * np.where(rows < 30, 0.04, 0.024), 0.5 + 0.02 * rows, 0.02 * columns])
-    variance = np.where((rows >= 40) & (rows < 42) & (columns < 20), 0.0, 4e-6)
-    reached = reach(place, variance, Config())
+    hidden = (rows >= 40) & (rows < 42) & (columns < 20)
+    reached = reach(place, np.where(hidden, 0.0, 4e-6), Config())
     assert not (reached & top)[:, :17].any() and reached[:, 24:].all() and reached[42:].all()
 
 
 def test_a_chain_comes_back_on_the_other_side_of_an_obstacle():
-    """Ground that walls hide from the front and the right is reached from behind them."""
+    """Ground that walls hide from the front and the right, but for two cells beside these."""
     rows, columns = np.indices((40, 40))
     wall = ((rows == 10) & (columns < 20)) | ((columns == 20) & (rows >= 10) & (rows < 30))
     place = np.stack([0.5 * wall, 0.5 + 0.02 * rows, 0.02 * (columns - 30)])
     reached = reach(place, np.full(rows.shape, 4e-6), Config(robot_radius=0.1, ground_gap=0.1))
-    # What is within two cells of a wall is none of the ground.
     assert reached[13:, :18].all() and not reached[wall].any()
 
 
@@ -233,14 +232,15 @@ def test_a_chain_begins_straight_ahead():
     place = np.stack([-0.04 * beside, 1 + 0.02 * rows, 0.05 * (columns - 30)])
     reached = reach(place, np.where((rows < 5) & ~beside, 0.0, 4e-6), Config())
     assert reached[6:, 27:34].all() and not reached[:, beside[0]].any()
+    # Or beside, where the ground comes into view farther away straight ahead.
+    assert reach(place, np.where((rows < 30) & ~beside, 0.0, 4e-6), Config())[0].any()
 
 
 def test_no_chain_goes_down_an_edge_that_is_blurred_over_two_cells():
     """Columns of 34 mm, 5.5 mm of noise: 38 mm down from the first on, with one cell between."""
     rows, columns = np.indices((60, 24))
     height = np.select([columns < 10, columns < 11], [0.0, -0.015], -0.038)
-    # A chain starts where all is ground.
-    height[rows < 12] = 0.0
+    height[rows < 12] = 0.0  # a chain starts where all is ground
     place = np.stack([height, 2.0 + 0.04 * rows, 0.034 * columns])
     reached = reach(place, np.full(rows.shape, 0.0055**2), Config())
     assert reached[:, :9].all() and not reached[20:, 10:].any()

@@ -37,13 +37,15 @@ def reach(place: Floats, variance: Floats, config: Config) -> Mask:
     reached = np.zeros(even.shape, np.bool_)
     if not even.any():
         return reached
-    # Where the ground comes into view straight ahead, no farther from the nearest of it than the
-    # robot is wide, and no step above or below most of that. It is near height 0, if anything is.
+    # Where the ground comes into view, straight ahead if it does there, no farther from the nearest
+    # of it than the robot is wide, no step above or below most of it, and near height 0 if any is.
     begin = even & (np.abs(place[0]) < HIGHEST_STEP)
     begin = begin if begin.any() else even
     front, columns, seen = begin.argmax(axis=0), np.arange(even.shape[1]), begin.any(axis=0)
     h, x, y = place[:, front, columns]
-    nearest = np.lexsort((np.hypot(x, y), np.abs(y) > radius, ~seen))[0]
+    distance = np.where(seen, np.hypot(x, y), np.inf)
+    ahead = (np.abs(y) <= radius) & (distance <= distance.min() + radius)
+    nearest = np.lexsort((distance, ~ahead))[0]
     start = seen & (np.hypot(x - x[nearest], y - y[nearest]) <= radius)
     start &= np.abs(h - np.median(h[start])) < step / 2
     reached[front[start], columns[start]] = True
