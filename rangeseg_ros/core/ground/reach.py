@@ -37,7 +37,7 @@ def reach(place: Floats, variance: Floats, config: Config) -> Mask:
     reached = np.zeros(even.shape, np.bool_)
     if not even.any():
         return reached
-    # Where the ground comes into view, straight ahead if it does there: no farther from the nearest
+    # Where the ground comes into view, straight ahead if it does: no farther from the nearest
     # of it than the robot is wide, no step off most of it, and near height 0 if any of it is.
     begin = even & (np.abs(place[0]) < HIGHEST_STEP)
     begin = begin if begin.any() else even
