@@ -23,13 +23,14 @@ _NEIGHBOURS = 4
 _BASELINES = 6
 
 
-def reach(place: Floats, variance: Floats, config: Config) -> Mask:
+def reach(place: Floats, variance: Floats, config: Config, body: bool = False) -> Mask:
     """Cells (rows, columns) that a chain leads to.
 
     `place` (3, rows, columns) is height and horizontal position, metres, NaN where nothing is
     measured, with the nearest row first; `variance` that of the height, 0 for cells that are no
     part of a chain. `robot_radius` says how far ground is looked for that leads to a cell, and how
-    far from the nearest ground straight ahead a chain begins.
+    far from the nearest straight ahead a chain begins, or beside it where a `body` may hide what
+    leads there.
     """
     step, slope, radius = config.least_step, config.steepest, config.robot_radius
     across = Task(_without_steps, 1, place, variance, step, slope)
@@ -41,12 +42,13 @@ def reach(place: Floats, variance: Floats, config: Config) -> Mask:
     # of it than the robot is wide, no step off most of it, and near height 0 if any of it is.
     begin = even & (np.abs(place[0]) < HIGHEST_STEP)
     begin = begin if begin.any() else even
-    front, columns, seen = begin.argmax(axis=0), np.arange(even.shape[1]), begin.any(axis=0)
+    front, columns = begin.argmax(axis=0), np.arange(even.shape[1])
     h, x, y = place[:, front, columns]
-    distance = np.where(seen, np.hypot(x, y), np.inf)
+    distance = np.where(begin.any(axis=0), np.hypot(x, y), np.inf)
     ahead = (np.abs(y) <= radius) & (distance <= distance.min() + radius)
     nearest = np.lexsort((distance, ~ahead))[0]
-    start = seen & (np.hypot(x - x[nearest], y - y[nearest]) <= radius)
+    start = distance <= distance.min() + radius
+    start &= body | (np.hypot(x - x[nearest], y - y[nearest]) <= radius)
     start &= np.abs(h - np.median(h[start])) < step / 2
     reached[front[start], columns[start]] = True
     _spread(place, variance, even, step / 2, slope, config.ground_gap, radius, reached)
@@ -124,11 +126,10 @@ def _spread(
     rejected = np.zeros(reached.shape, np.bool_)
     for k in range(2 * rows):
         i = min(k, 2 * rows - 1 - k)
-        # Both ways along a row: a cell that nothing leads to from the left, from the right.
+        # Both ways along a row; what cannot be reached gets its ground on the way back.
         for n in range(2 * columns):
             c = n if n < columns else 2 * columns - 1 - n
             free = even[i, c] and not rejected[i, c]
-            # What cannot be reached gets its ground on the way back along the row.
             if not variance[i, c] > 0 or (reached[i, c] if n >= columns else not free):
                 continue
             h, x, y, apart = place[0, i, c], place[1, i, c], place[2, i, c], 0.0

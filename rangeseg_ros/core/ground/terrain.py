@@ -103,7 +103,8 @@ def terrain_of(
     # A camera on its side: columns are along up in the image with rows and columns exchanged.
     rays = np.ascontiguousarray(image.rays.transpose(1, 0, 2))
     rays.flags.writeable = False  # as all rays are, or every kernel is compiled twice
-    turned = RangeImage(rays, np.ascontiguousarray(image.inverse.T))
+    body = None if image.body is None else image.body.T
+    turned = RangeImage(rays, np.ascontiguousarray(image.inverse.T), body=body)
     found = _upright(turned, sensor, up, known, config, bool(right > 0))
     return found._replace(
         classes=np.ascontiguousarray(found.classes.T),
@@ -123,10 +124,9 @@ def _upright(
     """The same for an image whose columns are along up; `turned` where up is down in it."""
     cells = cells_of(image, up, sensor, turned)
     place = cells.place.astype(np.float64)
-    height, height_sd = known
-    height = height or _nearest(place[0])
+    height, height_sd = known[0] or _nearest(place[0]), known[1]
     place[0] += height
-    reached = reach(place, cells.variance, config)
+    reached = reach(place, cells.variance, config, image.body is not None)
     seen = None
     if reached.any():
         seen = continued(place[:, reached], cells.variance[reached], height_sd, config)
