@@ -29,8 +29,7 @@ def reach(place: Floats, variance: Floats, config: Config, body: bool = False) -
     `place` (3, rows, columns) is height and horizontal position, metres, NaN where nothing is
     measured, with the nearest row first; `variance` that of the height, 0 for cells that are no
     part of a chain. `robot_radius` says how far ground is looked for that leads to a cell, and how
-    far from the nearest straight ahead a chain begins, or beside it where a `body` may hide what
-    leads there.
+    far from the nearest ahead, or where a `body` is in view also beside that, a chain begins.
     """
     step, slope, radius = config.least_step, config.steepest, config.robot_radius
     across = Task(_without_steps, 1, place, variance, step, slope)
